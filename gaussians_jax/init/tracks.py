@@ -216,14 +216,16 @@ def moving_depths(
       [frames, height, width] z-depth in scene units, 0 where unknown.
     """
     depths = np.zeros(evidence.moving.shape, np.float32)
-    tracks = evidence.tracks.take(paths.track)
     for frame, mask in enumerate(evidence.moving):
         # A fit may place a point behind the camera.
         rows = np.flatnonzero(paths.known[:, frame] & (depth[:, frame] > 0))
         row, column = np.nonzero(mask)
         if len(rows) < FEWEST_TRACKS or not len(row):
             continue
-        pixel, known = np.stack([column, row], -1) + 0.5, tracks.pixel[rows, frame]
+        pixel, known = (
+            np.stack([column, row], -1) + 0.5,
+            paths.tracks.pixel[rows, frame],
+        )
         count = min(DEPTH_TRACKS, len(rows))
         distance, neighbors = cKDTree(known).query(pixel, count)
         offset = known[neighbors] - pixel[:, None]

@@ -12,7 +12,6 @@ import math
 import pathlib
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
 from nerfies_jax.capture import cache, cache_files, pinholes
@@ -24,12 +23,11 @@ from nerfies_jax.preprocessing import (
     external_depth,
     external_resampling,
     lost_regions,
-    moving,
     patch_alignment,
     path_depths,
     paths,
-    photo_consistency,
     rest_points,
+    segmentation,
     short_tracks,
     still_points,
     view_set,
@@ -40,7 +38,6 @@ from nerfies_jax.preprocessing.record_file import Evidence, digest, load, save
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import (
-    A_COMPARED_PIXEL,
     A_PATCH_FRAME,
     A_POINT_FRAME,
     A_SEARCHED_PIXEL,
@@ -58,7 +55,7 @@ MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their f
 # discontinuous, and tracks are arbitrary.
 LEAST_CARRIED = 0.4
 # Shares of the budget above which a part is skipped.
-FOR_WIDE_STEPS, FOR_TRACKS, FOR_COLORS = 0.4, 0.5, 0.6
+FOR_WIDE_STEPS, FOR_TRACKS = 0.4, 0.5
 FOR_POINTS = 0.8
 LEAST_TEXTURED = 0.05  # minimum share of textured pixels
 MOST_UNKEPT = 2  # records in memory: of training frames, and of all frames
@@ -122,46 +119,42 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     tracks, first = _tracks(external, views, flow, images, starts, least)
     rest = rest_points.fit(views, tracks)
     watch.begin("moving")
+    unusable = _unusable(views, flow)
+    lengths = None if unusable or first else least
     mask = external_resampling.moving(external, views)
     if mask is None:
-        score = moving.track_scores(tracks, rest)
-        mask = _mask(views, flow, tracks, score, watch)
-        score = moving.settled(tracks, score, mask)
+        moves = segmentation.segmented(views, flow, tracks, rest, lengths, watch)
     else:
-        score = moving.share_on(tracks, mask)
+        moves = segmentation.of_mask(views, flow, tracks, mask, lengths, watch)
+    score = moves.score
     watch.begin("paths")
-    unusable = _unusable(views, flow)
-    which = np.zeros(0, int)
+    path_tracks = tracks.take(slice(0))
     if not unusable:
-        if least == short_tracks.SHORT and not first:
-            tracks, rest, score = short_tracks.with_more(
-                views, flow, images, mask, (tracks, rest, score), watch
-            )
-        which = _moved(tracks, score, first, least.path)
-        if not first:
-            watch.spend(1e-6 * A_PATCH_FRAME * tracks.visible[which].size)
-            tracks = patch_alignment.align(tracks, which, images, views.size)
-            which = which[_are_long(tracks.visible[which], least.path)]
+        own = tracks.take(slice(first, None))
+        path_tracks = _moved(own, score[first:], moves, least.path)
+    if not first:
+        watch.spend(1e-6 * A_PATCH_FRAME * path_tracks.visible.size)
+        path_tracks = patch_alignment.align(path_tracks, images, views.size)
+        path_tracks = path_tracks.take(_are_long(path_tracks, least.path))
     still = np.flatnonzero(score < paths.AT_REST)
     static = tracks.take(still), rest.take(still)
     depths = path_depths.known(capture, external, views, static, use_depths)
-    moving_tracks = tracks.take(which)
     moved_paths = path_depths.fitted(
-        capture, views, moving_tracks, static, depths, watch, least.known
+        capture, views, path_tracks, static, depths, watch, least.known
     )
     watch.begin("still")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
     if watch.has_room(FOR_POINTS, "dense static points", points_work):
-        dense = still_points.dense(views, flow, mask)
+        dense = still_points.dense(views, flow, moves.mask)
     return Evidence(
         row=views.row,
         flow=_rounded(flow),
-        moving=mask,
+        moving=moves.mask,
         tracks=tracks,
         score=score,
         rest=rest,
-        path_track=which,
+        path_tracks=path_tracks,
         paths=moved_paths,
         least_known=least.known,
         still=dense,
@@ -219,32 +212,6 @@ def _tracks(external, views, flow, images, starts, least):
         return own, 0
     both = zip(own, others, strict=True)
     return Tracks(*(np.concatenate(parts) for parts in both)), len(own.visible)
-
-
-def _mask(views, flow, tracks, score, watch):
-    """Segment moving pixels in reduced images, and enlarge the mask."""
-    (width, height), part = views.size, view_set.times_smaller(views)
-    small, near = (
-        view_set.smaller(views, part),
-        tracks._replace(pixel=tracks.pixel / part),
-    )
-    share = moving.votes(small, near, score)
-    open_to_doubt = _enlarged(moving.may_move(share), height, width)
-    odds = np.zeros(share.shape, np.float32)
-    work = 1e-6 * A_POINT_FRAME * still_points.work(views)
-    work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
-    if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
-        still = still_points.dense(views, flow, open_to_doubt)
-        odds = photo_consistency.log_odds(small, still)
-    masks = moving.mask(small, share, odds)
-    return _enlarged(masks, height, width) & views.valid
-
-
-def _enlarged(masks, height, width):
-    if masks.shape[1:] == (height, width):
-        return masks
-    enlarged = [cv2.resize(np.float32(one), (width, height)) > 0.5 for one in masks]
-    return np.stack(enlarged)
 
 
 def _depth_note(evidence: Evidence) -> str:
@@ -309,20 +276,23 @@ def carried(views: Views, flow: NeighborFlow) -> float:
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
-def _moved(tracks, score, first, shortest):
-    long = _are_long(tracks.visible, shortest)
-    wanted = np.arange(len(score)) >= first
-    which = np.flatnonzero(long & wanted & (score > MOVES))
+def _moved(tracks, score, moves, shortest):
+    """Return the tracks of moving points, at most `MOST_PATHS`."""
+    both = zip(tracks, moves.begun, strict=True)
+    tracks = Tracks(*map(np.concatenate, both))
+    score = np.concatenate([score, moves.begun_score])
+    which = np.flatnonzero(_are_long(tracks, shortest) & (score > MOVES))
     if len(which) > MOST_PATHS:
-        # Long tracks are preferred, but all regions should have some.
-        chance = tracks.visible[which].sum(1).astype(float)
+        # Long tracks are preferred, and those in frames with few.
+        visible = tracks.visible[which]
+        chance = (visible / np.maximum(visible.sum(0), 1)).sum(1)
         rng = np.random.default_rng(0)
         which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
-    return np.sort(which)
+    return tracks.take(np.sort(which))
 
 
-def _are_long(visible, shortest):
-    return visible.sum(1) >= min(shortest, visible.shape[1])
+def _are_long(tracks, shortest):
+    return tracks.visible.sum(1) >= min(shortest, tracks.visible.shape[1])
 
 
 def cached(

@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 21
+VERSION = 22
 
 
 class Evidence(NamedTuple):
@@ -28,7 +28,7 @@ class Evidence(NamedTuple):
     tracks: Tracks
     score: np.ndarray  # [tracks] in [0, 1], confidence that the point moves
     rest: RestPoints  # static point that explains each track best
-    path_track: np.ndarray  # [paths] index of the track of each path
+    path_tracks: Tracks  # of the paths, more of them than of moving `tracks`
     paths: Paths
     least_known: int  # minimum number of frames in which a usable path is known
     still: PointCloud  # dense static points
@@ -46,6 +46,7 @@ class Evidence(NamedTuple):
 RECORDS: dict[str, type[NamedTuple]] = {
     "flow": NeighborFlow,
     "tracks": Tracks,
+    "path_tracks": Tracks,
     "rest": RestPoints,
     "paths": Paths,
     "still": PointCloud,

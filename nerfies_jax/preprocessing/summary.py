@@ -69,7 +69,7 @@ def of(views: Views, evidence: Evidence) -> Summary:
         tracks=len(evidence.score),
         track_frames=_median(tracks.visible.sum(1)),
         moving_tracks=int((evidence.score > MOVES).sum()),
-        paths=len(evidence.path_track),
+        paths=len(evidence.paths.position),
         path_deviation=_median(paths.depth_deviation),
         rest_deviation=_median(parallax),
         points=len(evidence.still.position),

@@ -91,18 +91,20 @@ def grid(views: Views, sparser: int = 1, seed: int = 0) -> np.ndarray:
     return np.concatenate(starts)
 
 
-def grid_on(mask: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Return starting points on the pixels of a mask, on a finer grid in all frames.
+def grid_on(mask: np.ndarray, every: int = 1, seed: int = 0) -> np.ndarray:
+    """Return starting points on the pixels of a mask, on a finer grid.
 
     Args:
       mask: Pixels to start from, [frames, height, width] bool.
+      every: Interval between frames with starting points.
       seed: Seed for the choice if there are more than `MOST_ON_MASK`.
 
     Returns:
       Frame, column and row in pixels, [starts, 3].
     """
     step = max(round(mask.shape[2] / GRID_STEPS / 2), 1)
-    starts = np.argwhere(mask[:, ::step, ::step])[:, [0, 2, 1]] * [1, step, step]
+    starts = np.argwhere(mask[::every, ::step, ::step])[:, [0, 2, 1]]
+    starts = starts * [every, step, step]
     if len(starts) > MOST_ON_MASK:
         rng = np.random.default_rng(seed)
         starts = starts[np.sort(rng.choice(len(starts), MOST_ON_MASK, replace=False))]

@@ -12,6 +12,7 @@ from nerfies_jax.preprocessing import record
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.moving import image_scale
 from nerfies_jax.preprocessing.record import Evidence
+from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.training.track_start import TrackStartSpec
 
 # Minimum share of the moving pixels of all frames that have a known path near them.
@@ -33,7 +34,7 @@ class KnownPaths(NamedTuple):
     known: np.ndarray  # [paths, frames] bool
     depth_deviation: np.ndarray  # [paths] relative to the depth
     is_rigid: np.ndarray  # [paths] bool, on a rigid object
-    track: np.ndarray  # [paths] index of the track of each path
+    tracks: Tracks  # [paths]
 
 
 def evidence_to_start_from(capture: Capture, start: TrackStartSpec) -> Evidence | None:
@@ -98,7 +99,7 @@ def coverage(evidence: Evidence) -> float:
       The share, 0 if nothing moves.
     """
     usable = _is_known(evidence)
-    pixel = evidence.tracks.pixel[evidence.path_track[usable]]
+    pixel = evidence.path_tracks.pixel[usable]
     valid = evidence.paths.known[usable]
     shape = evidence.moving.shape[1:]
     reach, near = NEAR_PX * image_scale(shape[1]), 0
@@ -150,8 +151,8 @@ def known_paths(evidence: Evidence) -> KnownPaths:
     usable = _is_known(evidence)
     paths = [part[usable] for part in evidence.paths]
     position, known, _, deviation, is_rigid = paths
-    track = evidence.path_track[usable]
-    return KnownPaths(position, known, deviation, is_rigid, track)
+    tracks = evidence.path_tracks.take(usable)
+    return KnownPaths(position, known, deviation, is_rigid, tracks)
 
 
 def scene_unit(evidence: Evidence) -> float:

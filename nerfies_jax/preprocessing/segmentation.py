@@ -1,0 +1,163 @@
+"""Masks of moving pixels, and more tracks that begin on them.
+
+Tracks on a grid are few on small objects, and are aligned by translation, which loses
+most of their positions on objects that turn: 64 % of those of a backpack that is turned
+in the hand, half of which was then not in the mask. Tracks that begin on the mask are
+denser, and only chained, for `patch_alignment`. They also extend the mask.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from nerfies_jax.preprocessing import (
+    moving,
+    photo_consistency,
+    rest_points,
+    still_points,
+    view_set,
+)
+from nerfies_jax.preprocessing import tracks as tracking
+from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.short_tracks import SHORT, Lengths
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.view_set import Views
+from nerfies_jax.preprocessing.watch import (
+    A_COMPARED_PIXEL,
+    A_POINT_FRAME,
+    A_TRACK_FRAME,
+    Watch,
+)
+
+# Rounds of tracks from the mask and a mask from these tracks.
+ROUNDS = 2
+# Shares of the budget above which colors are not compared, and no tracks are added.
+FOR_COLORS, FOR_MORE = 0.6, 0.6
+
+
+class Moving(NamedTuple):
+    """Moving pixels and tracks."""
+
+    mask: np.ndarray  # [frames, height, width] bool
+    score: np.ndarray  # [tracks] in [0, 1], confidence that they move
+    begun: Tracks  # that begin on moving pixels, in addition
+    begun_score: np.ndarray  # [begun] their scores
+
+
+class _Colors(NamedTuple):
+    """Reduced images, and what their colors tell."""
+
+    views: Views
+    times: int  # by which they are reduced
+    odds: np.ndarray  # [frames, height, width] log odds that a pixel moves
+
+
+def segmented(
+    views: Views,
+    flow: NeighborFlow,
+    tracks: Tracks,
+    rest: RestPoints,
+    lengths: Lengths | None,
+    watch: Watch,
+) -> Moving:
+    """Segment what moves by tracks and colors.
+
+    Args:
+      views: The frames.
+      flow: Their flow.
+      tracks: Tracks of a grid.
+      rest: The static points that fit them best.
+      lengths: Minimum lengths of more tracks. None for no more tracks.
+      watch: Work budget.
+
+    Returns:
+      Pixels and tracks.
+    """
+    count, begun = len(tracks.start), tracks.take(slice(0))
+    score = moving.track_scores(tracks, rest)
+    share, colors = _colors(views, flow, tracks, score, watch)
+    mask = _mask(views, colors, share)
+    for _ in range(ROUNDS if lengths else 0):
+        begun = _begun_on(views, flow, mask, lengths, watch)
+        if not len(begun.start):
+            break
+        points = rest_points.fit(views, begun)
+        all_tracks = Tracks(*map(np.concatenate, zip(tracks, begun, strict=True)))
+        all_rest = RestPoints(*map(np.concatenate, zip(rest, points, strict=True)))
+        score = moving.track_scores(all_tracks, all_rest)
+        mask = _mask(views, colors, _votes(colors, all_tracks, score))
+    settled = moving.settled(tracks, score[:count], mask)
+    begun_score = moving.settled(begun, score[count:][: len(begun.start)], mask)
+    return Moving(mask, settled, begun, begun_score)
+
+
+def of_mask(
+    views: Views,
+    flow: NeighborFlow,
+    tracks: Tracks,
+    mask: np.ndarray,
+    lengths: Lengths | None,
+    watch: Watch,
+) -> Moving:
+    """Find the tracks that move by a given mask.
+
+    Args:
+      views: The frames.
+      flow: Their flow.
+      tracks: Tracks of a grid, or of the user.
+      mask: Moving pixels, [frames, height, width] bool.
+      lengths: As for `segmented`.
+      watch: Work budget.
+
+    Returns:
+      Pixels and tracks.
+    """
+    begun = tracks.take(slice(0))
+    if lengths:
+        begun = _begun_on(views, flow, mask, lengths, watch)
+    score, begun_score = (moving.share_on(each, mask) for each in (tracks, begun))
+    return Moving(mask, score, begun, begun_score)
+
+
+def _begun_on(views, flow, mask, lengths, watch):
+    """Chain tracks from the pixels of a mask."""
+    every = 1 if lengths == SHORT else tracking.EVERY_FRAMES
+    starts = tracking.grid_on(mask, every)
+    work = 1e-6 * A_TRACK_FRAME * len(starts) * len(views.row)
+    if not watch.has_room(FOR_MORE, "more tracks of moving objects", work):
+        starts = starts[:0]
+    return tracking.long_enough(tracking.chain(flow, starts), lengths.track)
+
+
+def _colors(views, flow, tracks, score, watch):
+    """Return the votes of tracks, and the evidence of colors, at a reduced size."""
+    times = view_set.times_smaller(views)
+    colors = _Colors(view_set.smaller(views, times), times, np.zeros(0))
+    share = _votes(colors, tracks, score)
+    odds = np.zeros(share.shape, np.float32)
+    work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
+    if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
+        may_move = _enlarged(moving.may_move(share), views.size)
+        still = still_points.dense(views, flow, may_move)
+        odds = photo_consistency.log_odds(colors.views, still)
+    return share, colors._replace(odds=odds)
+
+
+def _votes(colors, tracks, score):
+    near = tracks._replace(pixel=tracks.pixel / colors.times)
+    return moving.votes(colors.views, near, score)
+
+
+def _mask(views, colors, share):
+    masks = moving.mask(colors.views, share, colors.odds)
+    return _enlarged(masks, views.size) & views.valid
+
+
+def _enlarged(masks, size):
+    if masks.shape[:0:-1] == tuple(size):
+        return masks
+    enlarged = [cv2.resize(np.float32(one), size) > 0.5 for one in masks]
+    return np.stack(enlarged)
