@@ -86,7 +86,7 @@ def segmented(
         points = rest_points.fit(views, begun)
         all_tracks = Tracks(*map(np.concatenate, zip(tracks, begun, strict=True)))
         all_rest = RestPoints(*map(np.concatenate, zip(rest, points, strict=True)))
-        score = moving.track_scores(all_tracks, all_rest)
+        score = moving.track_scores(all_tracks, all_rest, count)
         mask = _mask(views, colors, _votes(colors, all_tracks, score))
     settled = moving.settled(tracks, score[:count], mask)
     begun_score = moving.settled(begun, score[count:][: len(begun.start)], mask)
