@@ -47,18 +47,17 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
 
 
 def _draw_tracks(image, evidence, frame, times):
-    tracks, moves = evidence.tracks, evidence.score > MOVES
-    rows = np.flatnonzero(tracks.visible[:, frame])
-    chosen = [_spread(rows[moves[rows] == kind], TRACKS // 2) for kind in (False, True)]
-    for row in np.concatenate(chosen):
-        color = BY_ITSELF if moves[row] else AT_REST
-        tail = np.arange(max(0, frame - TAIL), frame + 1)
-        # Only frames since the track was last invisible.
-        gap = np.flatnonzero(~tracks.visible[row, tail])
-        tail = tail[gap[-1] + 1 :] if len(gap) else tail
-        line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
-        cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA, shift=4)
-        cv2.circle(image, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
+    static = evidence.tracks.take(evidence.score <= MOVES)
+    for tracks, color in ((static, AT_REST), (evidence.path_tracks, BY_ITSELF)):
+        rows = np.flatnonzero(tracks.visible[:, frame])
+        for row in _spread(rows, TRACKS // 2):
+            tail = np.arange(max(0, frame - TAIL), frame + 1)
+            # Only frames since the track was last invisible.
+            gap = np.flatnonzero(~tracks.visible[row, tail])
+            tail = tail[gap[-1] + 1 :] if len(gap) else tail
+            line = np.round(tracks.pixel[row, tail] * times * 16).astype(np.int32)
+            cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA, shift=4)
+            cv2.circle(image, tuple(line[-1].tolist()), 24, color, -1, cv2.LINE_AA, 4)
 
 
 def _spread(rows, most):

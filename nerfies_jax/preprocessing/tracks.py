@@ -30,11 +30,11 @@ class Tracks(NamedTuple):
     pixel: np.ndarray  # [tracks, frames, 2] float32, 0 if not visible
     visible: np.ndarray  # [tracks, frames] bool, True if visible
 
-    def take(self, which: np.ndarray) -> "Tracks":
+    def take(self, which: np.ndarray | slice) -> "Tracks":
         """Select tracks.
 
         Args:
-          which: Indices or mask.
+          which: Indices, mask or slice.
 
         Returns:
           The selected tracks.

@@ -120,7 +120,7 @@ def test_coverage_is_the_share_of_moving_pixels_near_known_paths():
     known = np.zeros_like(evidence.paths.known)
     known[0, :8], known[1, :5] = True, True
     paths = evidence.paths._replace(known=known)
-    pixel = evidence.tracks.pixel[evidence.path_track[0]]
+    pixel = evidence.path_tracks.pixel[0]
     near = total = 0
     for frame, mask in enumerate(evidence.moving):
         for row, column in np.argwhere(mask):

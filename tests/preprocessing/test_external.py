@@ -93,8 +93,8 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     evidence = record.gather(capture)
     np.testing.assert_array_equal(evidence.moving, capture.moving[evidence.row])
     assert evidence.is_external
-    assert len(evidence.path_track) == len(points.pixel)
-    pixel = evidence.tracks.pixel[evidence.path_track]
+    assert len(evidence.paths.known) == len(points.pixel)
+    pixel = evidence.path_tracks.pixel
     np.testing.assert_allclose(
         pixel[points.visible], points.pixel[points.visible], atol=1e-4
     )

@@ -114,7 +114,7 @@ def test_depth_that_hardly_fits_is_used_with_a_warning(tmp_path, capsys):
         words = " ".join(capsys.readouterr().err.split())
         assert "differ from the static points by" in words
     assert record.notes_on(capture, tmp_path / "cache")
-    assert len(evidence.path_track)
+    assert len(evidence.paths.known)
 
 
 @pytest.mark.full

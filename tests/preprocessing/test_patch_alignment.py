@@ -61,7 +61,7 @@ def median_error(tracks, true):
 def test_points_of_a_turning_body_keep_their_place_on_it(images, dtype):
     tracks, true = tracks_of(dtype=dtype)
     shifted = tracking.realigned(tracks, images, SIZE)
-    warped = patch_alignment.align(tracks, np.arange(POINTS), images, SIZE)
+    warped = patch_alignment.align(tracks, images, SIZE)
     assert warped.pixel.dtype == dtype
     # Translated patches, which are turned by 50 degrees, do not reduce the drift.
     assert median_error(shifted, true) > 0.3
@@ -76,38 +76,44 @@ def test_points_of_a_tilting_plane_keep_their_place_on_it():
     tracks, true = tracks_of(motion="tilting")
     images = images_of("tilting")
     assert median_error(tracking.realigned(tracks, images, SIZE), true) > 0.2
-    warped = patch_alignment.align(tracks, np.arange(POINTS), images, SIZE)
+    warped = patch_alignment.align(tracks, images, SIZE)
     assert median_error(warped, true) < 0.06
     assert warped.visible.mean() > 0.95
 
 
-def test_points_that_move_too_far_are_invisible_and_others_untouched(images):
+def test_positions_that_do_not_resemble_the_patch_are_invisible(images):
     tracks, true = tracks_of()
-    tracks.pixel[:, 3] += 0.7  # 1 px in all, as where an object turns fast
-    tracks.pixel[:, 5] += 3.5
-    which = np.arange(0, POINTS // 2)
-    aligned = patch_alignment.align(tracks, which, images, SIZE)
-    step = np.linalg.norm(aligned.pixel - tracks.pixel, axis=-1)
-    assert (
-        step[aligned.visible].max()
-        < patch_alignment.PASSES * patch_alignment.FARTHEST_PX
-    )
-    assert (
-        aligned.visible[which, 5].mean() < 0.5 < 0.9 < aligned.visible[which, 4].mean()
-    )
-    miss = np.linalg.norm(aligned.pixel[which, 3] - true[which, 3], axis=-1)
-    assert np.median(miss) < 0.06
-    assert aligned.visible[which, 3].mean() > 0.9
+    tracks.pixel[:, 5] += 6.0  # as behind something
+    aligned = patch_alignment.align(tracks, images, SIZE)
+    assert aligned.visible[:, 5].mean() < 0.2 < 0.9 < aligned.visible[:, 4].mean()
     assert (aligned.pixel[~aligned.visible] == 0).all()
-    rest = np.s_[POINTS // 2 :]
-    np.testing.assert_array_equal(aligned.pixel[rest], tracks.pixel[rest])
-    assert aligned.visible[rest].all()
+    assert median_error(aligned, true) < 0.06
 
 
-def test_single_points_are_aligned_by_translation(images):
+def test_a_drift_that_accumulates_is_corrected(images):
+    """Up to 2.4 px in all, by 0.3 px from frame to frame."""
+    tracks, true = tracks_of(drift_px=0)
+    tracks.pixel[..., 0] += 0.3 * np.arange(FRAMES, dtype=np.float32)
+    aligned = patch_alignment.align(tracks, images, SIZE)
+    assert median_error(aligned, true) < 0.06
+    assert aligned.visible.mean() > 0.95
+
+
+def test_points_without_texture_stay_where_flow_leads(images):
+    """Noise of gray levels would move them by more than half a pixel."""
+    rng = np.random.default_rng(2)
+    plain = np.clip(128 + rng.normal(0, 1.5, images.shape), 0, 255).astype(np.uint8)
+    tracks, _ = tracks_of()
+    aligned = patch_alignment.align(tracks, plain, SIZE)
+    assert aligned.visible.all()
+    step = np.linalg.norm(aligned.pixel - tracks.pixel, axis=-1)
+    assert np.quantile(step, 0.95) < 0.1
+
+
+def test_few_points_are_aligned_by_translation(images):
     tracks, true = tracks_of(points=2)
-    aligned = patch_alignment.align(tracks, np.arange(2), images[:2], SIZE)
+    aligned = patch_alignment.align(tracks, images[:2], SIZE)
     miss = np.linalg.norm(aligned.pixel[:, 1] - true[:, 1], axis=-1)
     assert (miss < 0.15).all()  # a turn by 6 degrees
-    nothing = patch_alignment.align(tracks, np.zeros(0, int), images, SIZE)
-    np.testing.assert_array_equal(nothing.pixel, tracks.pixel)
+    nothing = patch_alignment.align(tracks.take(slice(0)), images, SIZE)
+    assert len(nothing.start) == 0

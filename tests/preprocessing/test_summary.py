@@ -77,7 +77,7 @@ def test_words_say_what_there_is_and_what_cannot_be_told():
     assert counted.paths > 20
     assert "their depth cannot be estimated" in text
     none = evidence._replace(
-        path_track=np.zeros(0, int),
+        path_tracks=evidence.path_tracks.take(slice(0)),
         paths=type(evidence.paths)(*(p[:0] for p in evidence.paths)),
     )
     text = summary.lines(summary.of(views_of(held), none), none)
@@ -89,7 +89,8 @@ def test_the_sheet_shows_what_moves_and_its_tracks():
     views = views_of(capture)
     bare = evidence._replace(
         moving=np.zeros_like(evidence.moving),
-        tracks=evidence.tracks.take(np.zeros(0, int)),
+        tracks=evidence.tracks.take(slice(0)),
+        path_tracks=evidence.path_tracks.take(slice(0)),
         score=np.zeros(0),
     )
     full, empty = (

@@ -201,7 +201,7 @@ def test_what_moves_is_marked_and_little_else():
     assert both > 0.85  # 0.80 by the votes of tracks alone
     assert not evidence.unusable
     # Tracks on the wall beside the card, which flow drags along, are not among them.
-    chosen = evidence.tracks.take(evidence.path_track)
+    chosen = evidence.path_tracks
     row, column = tracks.pixel_of(chosen.pixel, true.shape[1:])
     on_card = true[np.arange(len(true)), row, column] & chosen.visible
     assert (on_card.sum(1) > 0.5 * chosen.visible.sum(1)).mean() > 0.97
@@ -241,7 +241,7 @@ def test_smaller_views_show_the_same_points_in_larger_pixels():
 def test_nothing_moves_in_a_static_capture():
     _, evidence = gathered(card=lambda time: (0.1, 0.0))
     assert evidence.moving.mean() < 0.01
-    assert len(evidence.path_track) < 0.01 * len(evidence.score)
+    assert len(evidence.paths.known) < 0.01 * len(evidence.score)
 
 
 @pytest.mark.full
@@ -399,8 +399,8 @@ def test_what_moves_before_the_near_plane_of_the_wall_is_known():
     near = 0.8 * two_planes.FAR
     assert near > two_planes.NEAR
     evidence = record.gather(two_planes.make(**MOVES, frames=12, near=near))
-    assert len(evidence.path_track) > 20
-    seen = evidence.tracks.visible[evidence.path_track]
+    assert len(evidence.paths.known) > 20
+    seen = evidence.path_tracks.visible
     assert (evidence.paths.known & seen).sum() > 0.9 * seen.sum()
 
 
