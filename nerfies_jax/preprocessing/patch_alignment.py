@@ -10,6 +10,10 @@ camera paths each:
     turned and scaled           0.26 px, 0.5 %   0.18 px, 0.7 to 1.1 %
     affine                      0.21 px, 0.3 %
     affine, and once more       0.17 px, 0.2 %   0.13 px
+These began from positions aligned by translation, of which few remain where an object
+turns. From positions chained by flow, each with the correction of the frame before, the
+cube has 0.12 px instead of 0.18, and the arm 0.15 and 0.19 px with four times as many
+positions (one camera path).
 """
 
 from typing import NamedTuple
@@ -26,7 +30,7 @@ NEIGHBORS, FEWEST = 12, 4
 ROBUST_ROUNDS, NOISE_PX = 4, 0.5  # of the similarity transform, and of the affine one
 # Weight of the similarity transform, relative to the neighbors, which may be in a line.
 SIMILAR = 0.05
-STEP_PX = 0.75  # longest correction in a frame
+STEP_PX = 0.75  # Longer corrections in a frame are wrong, and flow remains.
 # Root mean square of differences below which patches are equal, and the correlation
 # below which they are otherwise different. On the arm of scene `articulated`, 37 to
 # 59 % of the positions with lower correlations are wrong by more than a pixel, but only
@@ -34,8 +38,9 @@ STEP_PX = 0.75  # longest correction in a frame
 NOISE_LEVELS, LEAST_CORRELATION = 6.0, 0.8
 PASSES = 2  # The second one has the warps of the aligned tracks.
 ROUNDS = 8  # of the search. With 20, errors are equal within 2 %.
-# Squared ratio of the errors of gray levels and of the flow in a frame in pixels. A
-# patch without texture, or along an edge, stays where flow leads.
+# Squared ratio of the errors of gray levels, 10, and of flow, 0.25 enlarged pixels. A
+# patch without texture, or along an edge, stays where flow leads. From 100 to 1600 the
+# median error of the cube decreases from 0.120 to 0.117 px.
 RIDGE = 1600.0
 
 
@@ -67,8 +72,7 @@ def align(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Tracks:
       size: Width and height in pixels of the images of the tracks.
 
     Returns:
-      The tracks. Positions that move by more than `STEP_PX` in a pass, relative to the
-      frame before, and those that do not resemble the patch, are invisible.
+      The tracks. Positions that do not resemble the patch are invisible.
 
     References:
       Baker and Matthews 2004.
@@ -100,8 +104,7 @@ def _aligned(tracks, images, times):
             place, fits = _search(
                 images[frame].astype(np.float32), own, warp, guess, times
             )
-            shift = np.where(fits[:, None], place - guess, 0) / times
-            correction[row] += shift
+            correction[row] += np.where(fits[:, None], place - guess, 0) / times
             pixel[row, frame] = np.where(fits[:, None], (place + 0.5) / times, 0)
             visible[row, frame] = fits
     return Tracks(tracks.start, pixel, visible)
@@ -141,7 +144,7 @@ def _patches(tracks, images, times):
 def _search(image, patches, warp, guess, times):
     """Return the positions in an enlarged image at which warped patches fit best.
 
-    Also returns where they are found: near the guess, and like the patch.
+    Also returns if the image resembles the patches there.
     """
     place, active = guess.copy(), np.arange(len(guess))
     offset = np.einsum("nij,kj->nki", warp, _grid(WINDOW_PX // 2)).astype(np.float32)

