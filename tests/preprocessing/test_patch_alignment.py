@@ -67,7 +67,7 @@ def test_points_of_a_turning_body_keep_their_place_on_it(images, dtype):
     assert median_error(shifted, true) > 0.3
     # The rounding of gray levels and the warps from drifting tracks leave this much.
     assert median_error(warped, true) < 0.06
-    assert warped.visible.mean() > 0.95
+    assert warped.visible.mean() > 0.9
     np.testing.assert_array_equal(warped.pixel[:, 0], tracks.pixel[:, 0])
 
 
@@ -78,7 +78,7 @@ def test_points_of_a_tilting_plane_keep_their_place_on_it():
     assert median_error(tracking.realigned(tracks, images, SIZE), true) > 0.2
     warped = patch_alignment.align(tracks, images, SIZE)
     assert median_error(warped, true) < 0.06
-    assert warped.visible.mean() > 0.95
+    assert warped.visible.mean() > 0.9
 
 
 def test_positions_that_do_not_resemble_the_patch_are_invisible(images):

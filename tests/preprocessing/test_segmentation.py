@@ -1,0 +1,85 @@
+"""Masks of what moves, and the tracks that begin on them."""
+
+import numpy as np
+
+from nerfies_jax.preprocessing import (
+    record,
+    rest_points,
+    segmentation,
+    tracks,
+    view_set,
+)
+from nerfies_jax.preprocessing.short_tracks import USUAL
+from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.watch import ENOUGH_WORK, Watch
+from tests.preprocessing.test_tracks import gathered
+
+
+def half_lost():
+    """Tracks of a grid without those on the lower half of the card, and that half."""
+    capture, evidence = gathered()
+    true = capture.moving[evidence.row]
+    lower = true.copy()
+    for frame, mask in enumerate(true):
+        rows = np.flatnonzero(mask.any(1))
+        lower[frame, : rows[len(rows) // 2]] = False
+    row, column = tracks.pixel_of(evidence.tracks.pixel, true.shape[1:])
+    on = lower[np.arange(len(true)), row, column] & evidence.tracks.visible
+    return (
+        view_set.in_time_order(capture),
+        evidence,
+        evidence.tracks.take(~on.any(1)),
+        true,
+        lower,
+    )
+
+
+def test_an_object_that_lost_half_of_its_tracks_is_completed():
+    views, evidence, left, true, lower = half_lost()
+    rest = rest_points.fit(views, left)
+
+    def segmented(lengths):
+        watch = Watch(lambda part: None, ENOUGH_WORK)
+        return segmentation.segmented(views, evidence.flow, left, rest, lengths, watch)
+
+    by_grid, completed = segmented(None), segmented(USUAL)
+    assert not len(by_grid.begun.start)
+    assert by_grid.mask[lower].mean() < 0.75 < 0.85 < completed.mask[lower].mean()
+    assert completed.mask[~true].mean() < 0.02
+    assert len(completed.score) == len(left.start)
+    # All but few of the tracks in addition follow the card, and its lower half as well.
+    moving = completed.begun.take(completed.begun_score > record.MOVES)
+    row, column = tracks.pixel_of(moving.pixel, true.shape[1:])
+    frames = np.arange(len(true))
+    assert true[frames, row, column][moving.visible].mean() > 0.95
+    assert lower[frames, row, column][moving.visible].mean() > 0.2
+
+
+def test_beyond_the_budget_no_track_is_added():
+    views, evidence, left, true, _ = half_lost()
+    told = []
+    watch = Watch(told.append, 1e-6)
+    watch.spend(1.0)
+    rest = rest_points.fit(views, left)
+    found = segmentation.segmented(views, evidence.flow, left, rest, USUAL, watch)
+    assert not len(found.begun.start)
+    assert not len(found.begun_score)
+    assert "more tracks of moving objects" in watch.left_out
+    given = segmentation.of_mask(views, evidence.flow, left, true, USUAL, watch)
+    assert not len(given.begun.start)
+    np.testing.assert_array_equal(given.mask, true)
+
+
+def test_paths_are_spread_over_the_regions_of_what_moves(monkeypatch):
+    """Nine tracks of ten begin on one region."""
+    rng, count = np.random.default_rng(0), 1000
+    monkeypatch.setattr(record, "MOST_PATHS", 100)
+    pixel = rng.uniform([5, 5], [20, 20], (count, 1, 2)).astype(np.float32)
+    pixel[::10] = rng.uniform([60, 60], [75, 75], (count // 10, 1, 2))
+    visible = np.ones((count, 12), bool)
+    grid = Tracks(np.zeros(count, int), pixel.repeat(12, 1), visible)
+    begun, score = grid.take(slice(0)), np.zeros(0)
+    moves = segmentation.Moving(np.zeros((12, 96, 96), bool), score, begun, score)
+    chosen = record._moved(grid, np.ones(count), moves, 10, (96, 96))
+    assert len(chosen.start) == 100
+    assert 0.3 < (chosen.pixel[:, 0, 0] > 40).mean() < 0.6
