@@ -50,7 +50,6 @@ from nerfies_jax.runtime import console
 SHORTEST_VIDEO = 6  # minimum number of frames of a video
 MOVES = 0.5  # score above which a track is considered as moving
 MOST_PATHS = 1500
-CELLS = 12  # regions over the width of an image in which tracks are counted
 MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their flow
 # Minimum share of textured pixels with consistent flow. Below it the camera motion is
 # discontinuous, and tracks are arbitrary.
@@ -132,7 +131,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     path_tracks = tracks.take(slice(0))
     if not unusable:
         own = tracks.take(slice(first, None))
-        path_tracks = _moved(own, score[first:], moves, least.path, views.size)
+        path_tracks = _moved(own, score[first:], moves, least.path)
     if not first:
         watch.spend(1e-6 * A_PATCH_FRAME * path_tracks.visible.size)
         path_tracks = patch_alignment.align(path_tracks, images, views.size)
@@ -277,30 +276,19 @@ def carried(views: Views, flow: NeighborFlow) -> float:
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
-def _moved(tracks, score, moves, shortest, size):
+def _moved(tracks, score, moves, shortest):
     """Return the tracks of moving points, at most `MOST_PATHS`."""
     both = zip(tracks, moves.begun, strict=True)
     tracks = Tracks(*map(np.concatenate, both))
     score = np.concatenate([score, moves.begun_score])
     which = np.flatnonzero(_are_long(tracks, shortest) & (score > MOVES))
     if len(which) > MOST_PATHS:
-        chance = _rarity(tracks.take(which), size)
+        # Long tracks are preferred, and those in frames with few.
+        visible = tracks.visible[which]
+        chance = (visible / np.maximum(visible.sum(0), 1)).sum(1)
         rng = np.random.default_rng(0)
         which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
     return tracks.take(np.sort(which))
-
-
-def _rarity(tracks, size):
-    """Return the sum over its frames of the share of each track of those around it.
-
-    Long tracks are preferred, and those in regions and frames with few.
-    """
-    row, frame = np.nonzero(tracks.visible)
-    cells = np.floor(tracks.pixel[row, frame] * (CELLS / size[0])).astype(int)
-    _, cell, count = np.unique(
-        np.column_stack([frame, cells]), axis=0, return_inverse=True, return_counts=True
-    )
-    return np.bincount(row, 1 / count[cell])
 
 
 def _are_long(tracks, shortest):

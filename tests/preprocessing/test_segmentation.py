@@ -70,16 +70,16 @@ def test_beyond_the_budget_no_track_is_added():
     np.testing.assert_array_equal(given.mask, true)
 
 
-def test_paths_are_spread_over_the_regions_of_what_moves(monkeypatch):
-    """Nine tracks of ten begin on one region."""
-    rng, count = np.random.default_rng(0), 1000
+def test_paths_are_spread_over_the_frames(monkeypatch):
+    """Nine tracks of ten are visible in the first frames only."""
+    count = 1000
     monkeypatch.setattr(record, "MOST_PATHS", 100)
-    pixel = rng.uniform([5, 5], [20, 20], (count, 1, 2)).astype(np.float32)
-    pixel[::10] = rng.uniform([60, 60], [75, 75], (count // 10, 1, 2))
-    visible = np.ones((count, 12), bool)
-    grid = Tracks(np.zeros(count, int), pixel.repeat(12, 1), visible)
+    visible = np.zeros((count, 24), bool)
+    visible[:, :12], visible[::10] = True, np.arange(24) >= 12
+    pixel = np.zeros((count, 24, 2), np.float32)
+    grid = Tracks(np.zeros(count, int), pixel, visible)
     begun, score = grid.take(slice(0)), np.zeros(0)
-    moves = segmentation.Moving(np.zeros((12, 96, 96), bool), score, begun, score)
-    chosen = record._moved(grid, np.ones(count), moves, 10, (96, 96))
+    moves = segmentation.Moving(np.zeros((24, 4, 4), bool), score, begun, score)
+    chosen = record._moved(grid, np.ones(count), moves, 10)
     assert len(chosen.start) == 100
-    assert 0.3 < (chosen.pixel[:, 0, 0] > 40).mean() < 0.6
+    assert 0.3 < chosen.visible[:, -1].mean() < 0.6
