@@ -135,7 +135,7 @@ def _patches(tracks, images, times):
     right = 0.5 * (value[:, 1:-1, 2:] - value[:, 1:-1, :-2])
     down = 0.5 * (value[:, 2:, 1:-1] - value[:, :-2, 1:-1])
     gradient = np.stack([right, down], axis=-1).reshape(points, WINDOW_PX**2, 2)
-    tensor = np.einsum("nki,nkj->nij", gradient, gradient)
+    tensor = gradient.swapaxes(1, 2) @ gradient
     inverse = np.linalg.inv(tensor + RIDGE * np.eye(2))
     value = value[:, 1:-1, 1:-1].reshape(points, WINDOW_PX**2)
     return Patches(value, gradient, inverse)
@@ -147,21 +147,17 @@ def _search(image, patches, warp, guess, times):
     Also returns if the image resembles the patches there.
     """
     place, active = guess.copy(), np.arange(len(guess))
-    offset = np.einsum("nij,kj->nki", warp, _grid(WINDOW_PX // 2)).astype(np.float32)
+    warp = warp.swapaxes(1, 2)  # of row vectors
+    offset = (_grid(WINDOW_PX // 2) @ warp).astype(np.float32)
     inverse_warp = np.linalg.inv(warp)
     for _ in range(ROUNDS):
         at = place[active]
         error = _sampled(image, at[:, None].astype(np.float32) + offset[active])
         error -= patches.value[active]
-        slope = np.einsum("nki,nk->ni", patches.gradient[active], error)
-        away = np.einsum("nij,nj->ni", inverse_warp[active], at - guess[active])
-        step = np.einsum(
-            "nij,njk,nk->ni",
-            warp[active],
-            patches.inverse[active],
-            slope + RIDGE * away,
-        )
-        step = np.clip(step, -times, times)  # a pixel at once
+        slope = error[:, None] @ patches.gradient[active]
+        away = (at - guess[active])[:, None] @ inverse_warp[active]
+        step = (slope + RIDGE * away) @ patches.inverse[active] @ warp[active]
+        step = np.clip(step[:, 0], -times, times)  # a pixel at once
         place[active] = at - step
         active = active[np.abs(step).max(1) > PRECISION_PX]
         if not len(active):
@@ -236,14 +232,15 @@ def _similarities(weight, source, target):
 
 def _affine(weight, source, target, similar):
     """Return linear maps from source to target near the similarities, [rows, 2, 2]."""
-    gram = np.einsum("nk,nki,nkj->nij", weight, source, source)
-    both = np.einsum("nk,nki,nkj->nij", weight, target, source)
+    weighted = weight[..., None] * source
+    gram = source.swapaxes(1, 2) @ weighted
+    both = target.swapaxes(1, 2) @ weighted
     prior = 0.5 * SIMILAR * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-9
     return (both + prior * similar) @ np.linalg.inv(gram + prior * np.eye(2))
 
 
 def _robust_weights(warp, source, target):
     """Return weights of neighbors by their distance from the warp (Cauchy)."""
-    miss = np.linalg.norm(target - np.einsum("nij,nkj->nki", warp, source), axis=-1)
+    miss = np.linalg.norm(target - source @ warp.swapaxes(1, 2), axis=-1)
     typical = NOISE_PX + np.median(miss, axis=1, keepdims=True)
     return 1 / (1 + (miss / typical) ** 2)
