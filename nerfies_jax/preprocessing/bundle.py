@@ -17,10 +17,12 @@ from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
 ROUNDS = 40
-SOFT_PX = 0.25  # scale of the Cauchy loss
+# Scales of the Cauchy loss, one after the other. The second one is not for poses alone,
+# which begin too far off if they are interpolated between frames.
+SOFT_PX = 0.5, 0.25
 # The variance of the error of a position grows with the time to the start of its track,
 # whose patch changes: the median error of a forearm is 0.06 px after 3 frames, 0.14
-# after 10, and 0.3 after more than 20. With equal weights, and a scale of 0.5 px above,
+# after 10, and 0.3 after more than 20. With equal weights, and only the first scale,
 # the depths of two forearms oscillate by 1.8 and 2.3 % (standard deviation over time),
 # and otherwise by 0.6 and 0.5 %.
 TWICE_FRAMES = 1.5  # in which the variance doubles
@@ -122,7 +124,9 @@ def adjusted(views: Views, sight: Sight, body: Body, bend_px: float = BEND_PX) -
     Returns:
       The adjusted object.
     """
-    return _minimize(views, sight, body, _step_of_all, bend_px)
+    for soft_px in SOFT_PX:
+        body = _minimize(views, sight, body, _step_of_all, soft_px, bend_px)
+    return body
 
 
 def posed(views: Views, sight: Sight, body: Body) -> Body:
@@ -136,17 +140,17 @@ def posed(views: Views, sight: Sight, body: Body) -> Body:
     Returns:
       The object with adjusted poses.
     """
-    return _minimize(views, sight, body, _step_of_poses)
+    return _minimize(views, sight, body, _step_of_poses, SOFT_PX[0])
 
 
-def _minimize(views, sight, body, step, bend_px=BEND_PX):
+def _minimize(views, sight, body, step, soft_px, bend_px=BEND_PX):
     smoothness = _smoothness(views, body, bend_px)
-    cost, damping = _cost(views, sight, body, smoothness), DAMPING
+    cost, damping = _cost(views, sight, body, smoothness, soft_px), DAMPING
     for _ in range(ROUNDS):
-        system = _system(views, sight, body, smoothness)
+        system = _system(views, sight, body, smoothness, soft_px)
         for _ in range(TRIES):
             candidate = step(body, system, damping)
-            new = _cost(views, sight, candidate, smoothness)
+            new = _cost(views, sight, candidate, smoothness, soft_px)
             if new < cost:
                 break
             damping *= 10
@@ -167,9 +171,9 @@ def _smoothness(views, body, bend_px):
     return (bend_px / max(distance, 1e-30)) ** 2 * second.T @ second
 
 
-def _cost(views, sight, body, smoothness):
+def _cost(views, sight, body, smoothness, soft_px):
     miss_sq = (_projected(views, sight, body)[0] ** 2).sum(-1)
-    robust = SOFT_PX**2 * (sight.weight * np.log1p(miss_sq / SOFT_PX**2)).sum()
+    robust = soft_px**2 * (sight.weight * np.log1p(miss_sq / soft_px**2)).sum()
     return robust + np.einsum("fi,fg,gi->", body.shift, smoothness, body.shift)
 
 
@@ -183,10 +187,10 @@ class _System(NamedTuple):
     point_gradient: np.ndarray  # [points, 3]
 
 
-def _system(views, sight, body, smoothness):
+def _system(views, sight, body, smoothness, soft_px):
     """Build the normal equations of one round, weighted by the Cauchy loss."""
     miss, gradient, arm = _projected(views, sight, body)
-    weight = _weights(sight, miss)
+    weight = _weights(sight, miss, soft_px)
     by_turn = np.cross(arm[:, None], gradient)
     by_pose = np.concatenate([gradient, by_turn], axis=-1)
     by_point = gradient @ body.rotation[sight.frame]
@@ -211,9 +215,9 @@ def _system(views, sight, body, smoothness):
     )
 
 
-def _weights(sight, miss):
+def _weights(sight, miss, soft_px):
     """Return weights of observations [entries] from errors [entries, 2] in px."""
-    return sight.weight / (1 + (miss**2).sum(-1) / SOFT_PX**2)
+    return sight.weight / (1 + (miss**2).sum(-1) / soft_px**2)
 
 
 def _products(weight, first, second):
@@ -284,7 +288,7 @@ def placed(views: Views, sight: Sight, body: Body) -> Body:
     point = body.point.copy()
     for _ in range(ROUNDS // 4):
         miss, gradient, _ = _projected(views, sight, body._replace(point=point))
-        weight = _weights(sight, miss)
+        weight = _weights(sight, miss, SOFT_PX[-1])
         by_point = gradient @ body.rotation[sight.frame]
         matrix, target = (
             _summed(_products(weight, by_point, factor), sight.track, len(point))

@@ -50,6 +50,8 @@ from nerfies_jax.runtime import console
 SHORTEST_VIDEO = 6  # minimum number of frames of a video
 MOVES = 0.5  # score above which a track is considered as moving
 MOST_PATHS = 1500
+# Regions over the width of an image, and the number of tracks in one that suffices.
+CELLS, ENOUGH_IN_CELL = 12, 4
 MOST_PIXELS = 16_000_000  # of all frames together, at 17 bytes each for their flow
 # Minimum share of textured pixels with consistent flow. Below it the camera motion is
 # discontinuous, and tracks are arbitrary.
@@ -131,7 +133,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     path_tracks = tracks.take(slice(0))
     if not unusable:
         own = tracks.take(slice(first, None))
-        path_tracks = _moved(own, score[first:], moves, least.path)
+        path_tracks = _moved(own, score[first:], moves, least.path, views.size)
     if not first:
         watch.spend(1e-6 * A_PATCH_FRAME * path_tracks.visible.size)
         path_tracks = patch_alignment.align(path_tracks, images, views.size)
@@ -276,19 +278,41 @@ def carried(views: Views, flow: NeighborFlow) -> float:
     return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
 
 
-def _moved(tracks, score, moves, shortest):
-    """Return the tracks of moving points, at most `MOST_PATHS`."""
-    both = zip(tracks, moves.begun, strict=True)
-    tracks = Tracks(*map(np.concatenate, both))
-    score = np.concatenate([score, moves.begun_score])
-    which = np.flatnonzero(_are_long(tracks, shortest) & (score > MOVES))
-    if len(which) > MOST_PATHS:
-        # Long tracks are preferred, and those in frames with few.
-        visible = tracks.visible[which]
-        chance = (visible / np.maximum(visible.sum(0), 1)).sum(1)
-        rng = np.random.default_rng(0)
-        which = rng.choice(which, MOST_PATHS, replace=False, p=chance / chance.sum())
-    return tracks.take(np.sort(which))
+def _moved(tracks, score, moves, shortest, size):
+    """Return the tracks of moving points, at most `MOST_PATHS`.
+
+    Those that begin on moving pixels are used where the others are few, because they
+    are less accurate.
+    """
+    tracks = tracks.take(_are_long(tracks, shortest) & (score > MOVES))
+    begun = moves.begun.take(
+        _are_long(moves.begun, shortest) & (moves.begun_score > MOVES)
+    )
+    begun = begun.take(_are_alone(begun, tracks, size))
+    both = Tracks(*map(np.concatenate, zip(tracks, begun, strict=True)))
+    if len(both.start) <= MOST_PATHS:
+        return both
+    # Long tracks are preferred, and those in frames with few.
+    chance = (both.visible / np.maximum(both.visible.sum(0), 1)).sum(1)
+    rng = np.random.default_rng(0)
+    which = rng.choice(len(chance), MOST_PATHS, replace=False, p=chance / chance.sum())
+    return both.take(np.sort(which))
+
+
+def _are_alone(begun, tracks, size):
+    """Find the tracks that have few of others around them in most of their frames."""
+    frames = begun.visible.shape[1]
+    rows = math.ceil(CELLS * size[1] / size[0])
+    count = np.zeros((frames, rows, CELLS), int)
+
+    def cells(one):
+        place = one.pixel * (CELLS / size[0])
+        row, column = tracking.pixel_of(place, (rows, CELLS))
+        return np.broadcast_to(np.arange(frames), row.shape), row, column
+
+    np.add.at(count, tuple(part[tracks.visible] for part in cells(tracks)), 1)
+    few = (count[cells(begun)] < ENOUGH_IN_CELL) & begun.visible
+    return few.sum(1) > 0.5 * begun.visible.sum(1)
 
 
 def _are_long(tracks, shortest):

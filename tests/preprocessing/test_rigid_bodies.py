@@ -207,6 +207,30 @@ def _motion(world):
     return np.stack(turn), middle
 
 
+def test_positions_far_from_the_start_of_a_track_count_less():
+    """Patches slip in the end, which looks like a change of distance if all do."""
+    seen_from, world = views(), turning_body()
+    body = bundle.Body(world[:, 0] - world[:, 0].mean(0), *_motion(world))
+    errors = []
+    for seed in range(3):
+        tracks = tracks_of(seen_from, world, noise_px=0.05, seed=seed)
+        age = np.arange(FRAMES) - tracks.start[:, None]
+        outward = tracks.pixel - tracks.pixel.mean(0)
+        slipped = 1 + 0.02 * np.maximum(age / 4 - 1, 0)
+        pixel = tracks.pixel + (slipped[..., None] - 1) * outward
+        seen = bundle.sight(
+            seen_from, tracks._replace(pixel=np.float32(pixel)), tracks.visible
+        )
+        np.testing.assert_allclose(seen.weight.mean(), 1)
+        equal = seen._replace(weight=np.ones_like(seen.weight))
+        for each in (seen, equal):
+            depth = bundle.adjusted(seen_from, each, body).world()[..., 2]
+            ratio = np.median(depth / world[..., 2], axis=0)
+            errors.append(np.std(ratio / ratio.mean()))
+    weighted, equal = np.mean(np.reshape(errors, (3, 2)), axis=0)
+    assert weighted < 0.9 * equal, (weighted, equal)
+
+
 def test_slopes_of_misses_are_differences():
     seen_from, world = views(), turning_body()
     body = bundle.Body(world[:, 0] - world[:, 0].mean(0), *_motion(world))
@@ -227,6 +251,8 @@ def test_slopes_of_misses_are_differences():
 
 def test_tracks_that_are_nowhere_known_miss_by_any_distance():
     none = np.zeros((0, 2))
-    nowhere = bundle.Sight(*np.zeros((2, 0), int), none, np.zeros((0, 2, 3)))
+    nowhere = bundle.Sight(
+        *np.zeros((2, 0), int), none, np.zeros((0, 2, 3)), none[:, 0]
+    )
     miss = bundle.typical_misses(nowhere, np.zeros(0), 3)
     np.testing.assert_array_equal(miss, np.inf)

@@ -70,16 +70,37 @@ def test_beyond_the_budget_no_track_is_added():
     np.testing.assert_array_equal(given.mask, true)
 
 
+def paths_of(grid, begun):
+    moves = segmentation.Moving(
+        np.zeros((24, 96, 96), bool),
+        np.ones(len(grid.start)),
+        begun,
+        np.ones(len(begun.start)),
+    )
+    return record._moved(grid, np.ones(len(grid.start)), moves, 10, (96, 96))
+
+
+def tracks_at(center, count, first=0, last=24):
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform(-3, 3, (count, 1, 2)).astype(np.float32) + np.float32(center)
+    frame = np.arange(24)
+    visible = np.tile((frame >= first) & (frame < last), (count, 1))
+    return Tracks(np.full(count, first), pixel.repeat(24, 1), visible)
+
+
+def test_tracks_are_added_where_those_of_the_grid_are_few():
+    grid = tracks_at([20, 20], 30)
+    near, far = tracks_at([20, 20], 20), tracks_at([70, 60], 20)
+    chosen = paths_of(grid, Tracks(*map(np.concatenate, zip(near, far, strict=True))))
+    assert len(chosen.start) == 50
+    np.testing.assert_array_equal(chosen.pixel[30:], far.pixel)
+
+
 def test_paths_are_spread_over_the_frames(monkeypatch):
     """Nine tracks of ten are visible in the first frames only."""
-    count = 1000
     monkeypatch.setattr(record, "MOST_PATHS", 100)
-    visible = np.zeros((count, 24), bool)
-    visible[:, :12], visible[::10] = True, np.arange(24) >= 12
-    pixel = np.zeros((count, 24, 2), np.float32)
-    grid = Tracks(np.zeros(count, int), pixel, visible)
-    begun, score = grid.take(slice(0)), np.zeros(0)
-    moves = segmentation.Moving(np.zeros((24, 4, 4), bool), score, begun, score)
-    chosen = record._moved(grid, np.ones(count), moves, 10)
+    early, late = tracks_at([20, 20], 900, last=12), tracks_at([20, 20], 100, first=12)
+    grid = Tracks(*map(np.concatenate, zip(early, late, strict=True)))
+    chosen = paths_of(grid, grid.take(slice(0)))
     assert len(chosen.start) == 100
     assert 0.3 < chosen.visible[:, -1].mean() < 0.6
