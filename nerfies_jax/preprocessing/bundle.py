@@ -24,7 +24,7 @@ SOFT_PX = 0.5, 0.25
 # whose patch changes: the median error of a forearm is 0.06 px after 3 frames, 0.14
 # after 10, and 0.3 after more than 20. With equal weights, and only the first scale,
 # the depths of two forearms oscillate by 1.8 and 2.3 % (standard deviation over time),
-# and otherwise by 0.6 and 0.5 %.
+# and otherwise by 0.7 and 1.1 %.
 TWICE_FRAMES = 1.5  # in which the variance doubles
 # Weight of second differences of the shifts, in pixels over the distance: negligible,
 # but sufficient in frames that do not show the object.
