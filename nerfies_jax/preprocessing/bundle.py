@@ -17,14 +17,12 @@ from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
 ROUNDS = 40
-# Scales of the Cauchy loss, one after the other. The second one is not for poses alone,
-# which begin too far off if they are interpolated between frames.
-SOFT_PX = 0.5, 0.25
+SOFT_PX = 0.5  # scale of the Cauchy loss
 # The variance of the error of a position grows with the time to the start of its track,
 # whose patch changes: the median error of a forearm is 0.06 px after 3 frames, 0.14
-# after 10, and 0.3 after more than 20. With equal weights, and only the first scale,
-# the depths of two forearms oscillate by 1.8 and 2.3 % (standard deviation over time),
-# and otherwise by 0.7 and 1.1 %.
+# after 10, and 0.3 after more than 20. With equal weights, the depths of two forearms
+# oscillate by 1.8 and 2.3 % (standard deviation over time), and otherwise by 1.1 and
+# 1.6 %.
 TWICE_FRAMES = 1.5  # in which the variance doubles
 # Weight of second differences of the shifts, in pixels over the distance: negligible,
 # but sufficient in frames that do not show the object.
@@ -124,9 +122,7 @@ def adjusted(views: Views, sight: Sight, body: Body, bend_px: float = BEND_PX) -
     Returns:
       The adjusted object.
     """
-    for soft_px in SOFT_PX:
-        body = _minimize(views, sight, body, _step_of_all, soft_px, bend_px)
-    return body
+    return _minimize(views, sight, body, _step_of_all, bend_px)
 
 
 def posed(views: Views, sight: Sight, body: Body) -> Body:
@@ -140,17 +136,17 @@ def posed(views: Views, sight: Sight, body: Body) -> Body:
     Returns:
       The object with adjusted poses.
     """
-    return _minimize(views, sight, body, _step_of_poses, SOFT_PX[0])
+    return _minimize(views, sight, body, _step_of_poses)
 
 
-def _minimize(views, sight, body, step, soft_px, bend_px=BEND_PX):
+def _minimize(views, sight, body, step, bend_px=BEND_PX):
     smoothness = _smoothness(views, body, bend_px)
-    cost, damping = _cost(views, sight, body, smoothness, soft_px), DAMPING
+    cost, damping = _cost(views, sight, body, smoothness), DAMPING
     for _ in range(ROUNDS):
-        system = _system(views, sight, body, smoothness, soft_px)
+        system = _system(views, sight, body, smoothness)
         for _ in range(TRIES):
             candidate = step(body, system, damping)
-            new = _cost(views, sight, candidate, smoothness, soft_px)
+            new = _cost(views, sight, candidate, smoothness)
             if new < cost:
                 break
             damping *= 10
@@ -171,9 +167,9 @@ def _smoothness(views, body, bend_px):
     return (bend_px / max(distance, 1e-30)) ** 2 * second.T @ second
 
 
-def _cost(views, sight, body, smoothness, soft_px):
+def _cost(views, sight, body, smoothness):
     miss_sq = (_projected(views, sight, body)[0] ** 2).sum(-1)
-    robust = soft_px**2 * (sight.weight * np.log1p(miss_sq / soft_px**2)).sum()
+    robust = SOFT_PX**2 * (sight.weight * np.log1p(miss_sq / SOFT_PX**2)).sum()
     return robust + np.einsum("fi,fg,gi->", body.shift, smoothness, body.shift)
 
 
@@ -187,10 +183,10 @@ class _System(NamedTuple):
     point_gradient: np.ndarray  # [points, 3]
 
 
-def _system(views, sight, body, smoothness, soft_px):
+def _system(views, sight, body, smoothness):
     """Build the normal equations of one round, weighted by the Cauchy loss."""
     miss, gradient, arm = _projected(views, sight, body)
-    weight = _weights(sight, miss, soft_px)
+    weight = _weights(sight, miss)
     by_turn = np.cross(arm[:, None], gradient)
     by_pose = np.concatenate([gradient, by_turn], axis=-1)
     by_point = gradient @ body.rotation[sight.frame]
@@ -215,9 +211,9 @@ def _system(views, sight, body, smoothness, soft_px):
     )
 
 
-def _weights(sight, miss, soft_px):
+def _weights(sight, miss):
     """Return weights of observations [entries] from errors [entries, 2] in px."""
-    return sight.weight / (1 + (miss**2).sum(-1) / soft_px**2)
+    return sight.weight / (1 + (miss**2).sum(-1) / SOFT_PX**2)
 
 
 def _products(weight, first, second):
@@ -288,7 +284,7 @@ def placed(views: Views, sight: Sight, body: Body) -> Body:
     point = body.point.copy()
     for _ in range(ROUNDS // 4):
         miss, gradient, _ = _projected(views, sight, body._replace(point=point))
-        weight = _weights(sight, miss, SOFT_PX[-1])
+        weight = _weights(sight, miss)
         by_point = gradient @ body.rotation[sight.frame]
         matrix, target = (
             _summed(_products(weight, by_point, factor), sight.track, len(point))
