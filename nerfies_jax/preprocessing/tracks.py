@@ -97,7 +97,8 @@ def grid_on(mask: np.ndarray, every: int = 1, seed: int = 0) -> np.ndarray:
     Args:
       mask: Pixels to start from, [frames, height, width] bool.
       every: Interval between frames with starting points.
-      seed: Seed for the choice if there are more than `MOST_ON_MASK`.
+      seed: Seed for the choice if there are more than `MOST_ON_MASK`, or more than
+        `MOST_PLACES` in all frames together.
 
     Returns:
       Frame, column and row in pixels, [starts, 3].
@@ -105,9 +106,10 @@ def grid_on(mask: np.ndarray, every: int = 1, seed: int = 0) -> np.ndarray:
     step = max(round(mask.shape[2] / GRID_STEPS / 2), 1)
     starts = np.argwhere(mask[::every, ::step, ::step])[:, [0, 2, 1]]
     starts = starts * [every, step, step]
-    if len(starts) > MOST_ON_MASK:
+    most = min(MOST_ON_MASK, MOST_PLACES // len(mask))
+    if len(starts) > most:
         rng = np.random.default_rng(seed)
-        starts = starts[np.sort(rng.choice(len(starts), MOST_ON_MASK, replace=False))]
+        starts = starts[np.sort(rng.choice(len(starts), most, replace=False))]
     return starts + np.array([0, 0.5, 0.5])
 
 

@@ -153,3 +153,10 @@ def test_starts_on_a_mask_lie_on_it(share):
     frame, column, row = starts.astype(int).T
     assert mask[frame, row, column].all()
     assert len(starts) == share * 200
+
+
+def test_starts_on_a_mask_are_fewer_in_long_videos(monkeypatch):
+    monkeypatch.setattr(tracks, "MOST_PLACES", 200)
+    starts = tracks.grid_on(np.ones((4, 30, 58), bool), every=2)
+    assert len(starts) == 50
+    assert set(starts[:, 0]) == {0, 2}
