@@ -222,10 +222,8 @@ def moving_depths(
         row, column = np.nonzero(mask)
         if len(rows) < FEWEST_TRACKS or not len(row):
             continue
-        pixel, known = (
-            np.stack([column, row], -1) + 0.5,
-            paths.tracks.pixel[rows, frame],
-        )
+        pixel = np.stack([column, row], -1) + 0.5
+        known = paths.tracks.pixel[rows, frame]
         count = min(DEPTH_TRACKS, len(rows))
         distance, neighbors = cKDTree(known).query(pixel, count)
         offset = known[neighbors] - pixel[:, None]
