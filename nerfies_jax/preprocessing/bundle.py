@@ -20,9 +20,9 @@ ROUNDS = 40
 SOFT_PX = 0.5  # scale of the Cauchy loss
 # The variance of the error of a position grows with the time to the start of its track,
 # whose patch changes: the median error of a forearm is 0.06 px after 3 frames, 0.14
-# after 10, and 0.3 after more than 20. With equal weights, the depths of two forearms
-# oscillate by 1.8 and 2.3 % (standard deviation over time), and otherwise by 1.1 and
-# 1.6 %.
+# after 10, and 0.3 after more than 20. With all tracks that begin on the mask and equal
+# weights, the depths of two forearms oscillate by 1.8 and 2.3 % (standard deviation
+# over time), and with these weights by 1.1 and 1.6 %.
 TWICE_FRAMES = 1.5  # in which the variance doubles
 # Weight of second differences of the shifts, in pixels over the distance: negligible,
 # but sufficient in frames that do not show the object.

@@ -31,15 +31,15 @@ SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
 
 
 def track_scores(
-    tracks: Tracks, rest: RestPoints, unbiased: int | None = None
+    tracks: Tracks, rest: RestPoints, noise_tracks: int | None = None
 ) -> np.ndarray:
     """Estimate the confidence that each track moves.
 
     Args:
       tracks: The tracks.
       rest: The static points that fit them best.
-      unbiased: Number of tracks, the first ones, that begin anywhere and determine the
-        noise. None for all.
+      noise_tracks: Number of tracks, the first ones, that begin anywhere and determine
+        the noise. None for all.
 
     Returns:
       Scores in [0, 1], [tracks].
@@ -48,7 +48,7 @@ def track_scores(
     if count == 0:
         return np.zeros(0)
     far = rest_points.miss(rest)
-    half = max(HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far[:unbiased], STILLEST))
+    half = max(HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far[:noise_tracks], STILLEST))
     with np.errstate(divide="ignore"):
         odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / half)
     probability = 1 / (1 + np.exp(-np.minimum(odds, 50)))

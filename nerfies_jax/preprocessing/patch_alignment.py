@@ -67,7 +67,7 @@ def align(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Tracks:
     the warp is known from the tracks. Flow is a prior for the translation.
 
     Args:
-      tracks: Tracks of moving points, chained by flow.
+      tracks: Tracks of moving points, chained by flow or aligned by translation.
       images: Enlarged images from `dense_flow.leveled`.
       size: Width and height in pixels of the images of the tracks.
 

@@ -35,7 +35,6 @@ from nerfies_jax.preprocessing import (
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.record_file import Evidence, digest, load, save
-from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import (
     A_PATCH_FRAME,
@@ -124,10 +123,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     unusable = _unusable(views, flow)
     lengths = None if unusable or first else least
     mask = external_resampling.moving(external, views)
-    if mask is None:
-        moves = segmentation.segmented(views, flow, tracks, rest, lengths, watch)
-    else:
-        moves = segmentation.of_mask(views, flow, tracks, mask, lengths, watch)
+    moves = segmentation.segmented(views, flow, tracks, rest, lengths, watch, mask)
     score = moves.score
     watch.begin("paths")
     path_tracks = tracks.take(slice(0))
@@ -212,8 +208,7 @@ def _tracks(external, views, flow, images, starts, least):
     others = external_resampling.tracks(external, views)
     if others is None:
         return own, 0
-    both = zip(own, others, strict=True)
-    return Tracks(*(np.concatenate(parts) for parts in both)), len(own.visible)
+    return tracking.joined([own, others]), len(own.visible)
 
 
 def _depth_note(evidence: Evidence) -> str:
@@ -281,15 +276,15 @@ def carried(views: Views, flow: NeighborFlow) -> float:
 def _moved(tracks, score, moves, shortest, size):
     """Return the tracks of moving points, at most `MOST_PATHS`.
 
-    Those that begin on moving pixels are used where the others are few, because they
-    are less accurate.
+    Those that begin on the mask are used where the others are few, because they are
+    less accurate.
     """
     tracks = tracks.take(_are_long(tracks, shortest) & (score > MOVES))
-    begun = moves.begun.take(
-        _are_long(moves.begun, shortest) & (moves.begun_score > MOVES)
+    more = moves.mask_tracks.take(
+        _are_long(moves.mask_tracks, shortest) & (moves.mask_score > MOVES)
     )
-    begun = begun.take(_are_alone(begun, tracks, size))
-    both = Tracks(*map(np.concatenate, zip(tracks, begun, strict=True)))
+    more = more.take(_are_sparse(more, tracks, size))
+    both = tracking.joined([tracks, more])
     if len(both.start) <= MOST_PATHS:
         return both
     # Long tracks are preferred, and those in frames with few.
@@ -299,9 +294,9 @@ def _moved(tracks, score, moves, shortest, size):
     return both.take(np.sort(which))
 
 
-def _are_alone(begun, tracks, size):
-    """Find the tracks that have few of others around them in most of their frames."""
-    frames = begun.visible.shape[1]
+def _are_sparse(more, tracks, size):
+    """Find those of `more` that have few `tracks` around them in most frames."""
+    frames = more.visible.shape[1]
     rows = math.ceil(CELLS * size[1] / size[0])
     count = np.zeros((frames, rows, CELLS), int)
 
@@ -311,8 +306,8 @@ def _are_alone(begun, tracks, size):
         return np.broadcast_to(np.arange(frames), row.shape), row, column
 
     np.add.at(count, tuple(part[tracks.visible] for part in cells(tracks)), 1)
-    few = (count[cells(begun)] < ENOUGH_IN_CELL) & begun.visible
-    return few.sum(1) > 0.5 * begun.visible.sum(1)
+    few = (count[cells(more)] < ENOUGH_IN_CELL) & more.visible
+    return few.sum(1) > 0.5 * more.visible.sum(1)
 
 
 def _are_long(tracks, shortest):

@@ -28,7 +28,7 @@ class Evidence(NamedTuple):
     tracks: Tracks
     score: np.ndarray  # [tracks] in [0, 1], confidence that the point moves
     rest: RestPoints  # static point that explains each track best
-    path_tracks: Tracks  # of the paths, more of them than of moving `tracks`
+    path_tracks: Tracks  # of the paths, aligned
     paths: Paths
     least_known: int  # minimum number of frames in which a usable path is known
     still: PointCloud  # dense static points

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfies_jax.geometry.rays import across_ray
 from nerfies_jax.preprocessing import view_set
-from nerfies_jax.preprocessing.tracks import Tracks
+from nerfies_jax.preprocessing.tracks import Tracks, joined
 from nerfies_jax.preprocessing.view_set import Views
 
 ROUNDS = 4  # of reweighting, because the error in pixels depends on the depth
@@ -67,8 +67,7 @@ def fit(views: Views, tracks: Tracks) -> RestPoints:
     """
     count = len(tracks.visible)
     blocks = np.split(np.arange(count), range(AT_ONCE, count, AT_ONCE))
-    parts = [_fit(views, tracks.take(block)) for block in blocks]
-    return RestPoints(*map(np.concatenate, zip(*parts, strict=True)))
+    return joined([_fit(views, tracks.take(block)) for block in blocks])
 
 
 def _fit(views, tracks):

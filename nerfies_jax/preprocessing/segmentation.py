@@ -3,7 +3,8 @@
 Tracks on a grid are few on small objects, and are aligned by translation, which loses
 most of their positions on objects that turn: 64 % of those of a backpack that is turned
 in the hand, half of which was then not in the mask. Tracks that begin on the mask are
-denser, and only chained, for `patch_alignment`. They also extend the mask.
+denser, and only chained, for `patch_alignment`. They extend the mask, and have paths
+where tracks on the grid are few (`record`).
 """
 
 from typing import NamedTuple
@@ -45,8 +46,8 @@ class Moving(NamedTuple):
 
     mask: np.ndarray  # [frames, height, width] bool
     score: np.ndarray  # [tracks] in [0, 1], confidence that they move
-    begun: Tracks  # that begin on moving pixels, in addition
-    begun_score: np.ndarray  # [begun] their scores
+    mask_tracks: Tracks  # that begin on the mask, in addition
+    mask_score: np.ndarray  # [mask_tracks] in [0, 1]
 
 
 class _Colors(NamedTuple):
@@ -64,67 +65,56 @@ def segmented(
     rest: RestPoints,
     lengths: Lengths | None,
     watch: Watch,
+    mask: np.ndarray | None = None,
 ) -> Moving:
-    """Segment what moves by tracks and colors.
-
-    Args:
-      views: The frames.
-      flow: Their flow.
-      tracks: Tracks of a grid.
-      rest: The static points that fit them best.
-      lengths: Minimum lengths of more tracks. None for no more tracks.
-      watch: Work budget.
-
-    Returns:
-      Pixels and tracks.
-    """
-    count, begun = len(tracks.start), tracks.take(slice(0))
-    score = moving.track_scores(tracks, rest)
-    share, colors = _colors(views, flow, tracks, score, watch)
-    mask = _mask(views, colors, share)
-    for _ in range(ROUNDS if lengths else 0):
-        begun = _begun_on(views, flow, mask, lengths, watch)
-        if not len(begun.start):
-            break
-        points = rest_points.fit(views, begun)
-        all_tracks = Tracks(*map(np.concatenate, zip(tracks, begun, strict=True)))
-        all_rest = RestPoints(*map(np.concatenate, zip(rest, points, strict=True)))
-        score = moving.track_scores(all_tracks, all_rest, count)
-        mask = _mask(views, colors, _votes(colors, all_tracks, score))
-    settled = moving.settled(tracks, score[:count], mask)
-    begun_score = moving.settled(begun, score[count:][: len(begun.start)], mask)
-    return Moving(mask, settled, begun, begun_score)
-
-
-def of_mask(
-    views: Views,
-    flow: NeighborFlow,
-    tracks: Tracks,
-    mask: np.ndarray,
-    lengths: Lengths | None,
-    watch: Watch,
-) -> Moving:
-    """Find the tracks that move by a given mask.
+    """Segment what moves by tracks and colors, or by a mask.
 
     Args:
       views: The frames.
       flow: Their flow.
       tracks: Tracks of a grid, or of the user.
-      mask: Moving pixels, [frames, height, width] bool.
-      lengths: As for `segmented`.
+      rest: The static points that fit them best.
+      lengths: Minimum lengths of tracks that begin on the mask. None for no such
+        tracks.
       watch: Work budget.
+      mask: Moving pixels, [frames, height, width] bool, if they are known.
 
     Returns:
       Pixels and tracks.
     """
-    begun = tracks.take(slice(0))
+    if mask is None:
+        return _by_tracks(views, flow, tracks, rest, lengths, watch)
+    mask_tracks = tracks.take(slice(0))
     if lengths:
-        begun = _begun_on(views, flow, mask, lengths, watch)
-    score, begun_score = (moving.share_on(each, mask) for each in (tracks, begun))
-    return Moving(mask, score, begun, begun_score)
+        mask_tracks = _tracks_on(views, flow, mask, lengths, watch)
+    score, mask_score = (moving.share_on(each, mask) for each in (tracks, mask_tracks))
+    return Moving(mask, score, mask_tracks, mask_score)
 
 
-def _begun_on(views, flow, mask, lengths, watch):
+def _by_tracks(views, flow, tracks, rest, lengths, watch):
+    mask_tracks = tracks.take(slice(0))
+    score = moving.track_scores(tracks, rest)
+    share, colors = _colors(views, flow, tracks, score, watch)
+    mask = _mask(views, colors, share)
+    for _ in range(ROUNDS if lengths else 0):
+        mask_tracks = _tracks_on(views, flow, mask, lengths, watch)
+        if not len(mask_tracks.start):
+            break
+        points = rest_points.fit(views, mask_tracks)
+        all_tracks = tracking.joined([tracks, mask_tracks])
+        all_rest = tracking.joined([rest, points])
+        score = moving.track_scores(all_tracks, all_rest, len(tracks.start))
+        mask = _mask(views, colors, _votes(colors, all_tracks, score))
+    count, added = len(tracks.start), len(mask_tracks.start)
+    return Moving(
+        mask,
+        moving.settled(tracks, score[:count], mask),
+        mask_tracks,
+        moving.settled(mask_tracks, score[count:][:added], mask),
+    )
+
+
+def _tracks_on(views, flow, mask, lengths, watch):
     """Chain tracks from the pixels of a mask, but not from its rim."""
     every = 1 if lengths == SHORT else tracking.EVERY_FRAMES
     side = 2 * round(RIM_PX * moving.image_scale(mask.shape[2])) + 1

@@ -1,7 +1,8 @@
 """Point tracks through a video, realigned with the frames in which they begin."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -40,6 +41,21 @@ class Tracks(NamedTuple):
           The selected tracks.
         """
         return Tracks(*(part[which] for part in self))
+
+
+Record = TypeVar("Record", bound=tuple)
+
+
+def joined(records: Sequence[Record]) -> Record:
+    """Concatenate records of tracks.
+
+    Args:
+      records: Named tuples of one kind, such as `Tracks`, of arrays over tracks.
+
+    Returns:
+      The record of all tracks.
+    """
+    return type(records[0])(*map(np.concatenate, zip(*records, strict=True)))
 
 
 def pixel_of(

@@ -43,12 +43,12 @@ def test_an_object_that_lost_half_of_its_tracks_is_completed():
         return segmentation.segmented(views, evidence.flow, left, rest, lengths, watch)
 
     by_grid, completed = segmented(None), segmented(USUAL)
-    assert not len(by_grid.begun.start)
+    assert not len(by_grid.mask_tracks.start)
     assert by_grid.mask[lower].mean() < 0.75 < 0.85 < completed.mask[lower].mean()
     assert completed.mask[~true].mean() < 0.02
     assert len(completed.score) == len(left.start)
     # All but few of the tracks in addition follow the card, and its lower half as well.
-    moving = completed.begun.take(completed.begun_score > record.MOVES)
+    moving = completed.mask_tracks.take(completed.mask_score > record.MOVES)
     row, column = tracks.pixel_of(moving.pixel, true.shape[1:])
     frames = np.arange(len(true))
     assert true[frames, row, column][moving.visible].mean() > 0.95
@@ -62,11 +62,11 @@ def test_beyond_the_budget_no_track_is_added():
     watch.spend(1.0)
     rest = rest_points.fit(views, left)
     found = segmentation.segmented(views, evidence.flow, left, rest, USUAL, watch)
-    assert not len(found.begun.start)
-    assert not len(found.begun_score)
+    assert not len(found.mask_tracks.start)
+    assert not len(found.mask_score)
     assert "more tracks of moving objects" in watch.left_out
-    given = segmentation.of_mask(views, evidence.flow, left, true, USUAL, watch)
-    assert not len(given.begun.start)
+    given = segmentation.segmented(views, evidence.flow, left, rest, USUAL, watch, true)
+    assert not len(given.mask_tracks.start)
     np.testing.assert_array_equal(given.mask, true)
 
 
