@@ -117,11 +117,11 @@ def project(
     # formed, so no 0 * inf reaches the gradient.
     reach = jnp.max(jnp.abs(lateral))
     divisor = jnp.maximum(depth, jnp.maximum(reach / MAX_SLOPE, MIN_DEPTH))
-    distorted = lens.distort(camera, lateral / divisor)
+    distorted_xy = lens.distort(camera, lateral / divisor)
     pixel = jnp.stack(
         [
-            camera.focal_px * distorted[0] + camera.skew_px * distorted[1],
-            camera.focal_px * camera.pixel_aspect * distorted[1],
+            camera.focal_px * distorted_xy[0] + camera.skew_px * distorted_xy[1],
+            camera.focal_px * camera.pixel_aspect * distorted_xy[1],
         ]
     )
     return pixel + camera.principal_point_px, depth
@@ -167,12 +167,12 @@ def unproject(
     """
     refuse_half("the camera or the pixel", camera.position, pixel)
     offset = pixel - camera.principal_point_px
-    bent_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
-    bent_x = (offset[0] - camera.skew_px * bent_y) / camera.focal_px
-    slopes, converged = lens.undistort(camera, jnp.stack([bent_x, bent_y]))
+    distorted_y = offset[1] / (camera.focal_px * camera.pixel_aspect)
+    distorted_x = (offset[0] - camera.skew_px * distorted_y) / camera.focal_px
+    slopes, has_solution = lens.undistort(camera, jnp.stack([distorted_x, distorted_y]))
     in_camera = jnp.concatenate([slopes, jnp.ones_like(slopes[:1])])
     in_camera = in_camera / jnp.sqrt(jnp.sum(in_camera**2))  # at least 1: no zero here
-    return exact_product(in_camera, camera.camera_from_world), converged
+    return exact_product(in_camera, camera.camera_from_world), has_solution
 
 
 def forward_axis(camera: Camera) -> Float[Array, "*batch 3"]:
@@ -425,11 +425,11 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
             f"{name}: orientation is not orthonormal{_row(drift > 1e-3, 0)}: "
             f"|R Rᵀ - 1| = {drift.max():.2g} > 1e-3; take the scale out of the pose"
         )
-    mirrored = np.linalg.det(rotation) < 0
-    if mirrored.any():
+    is_mirrored = np.linalg.det(rotation) < 0
+    if is_mirrored.any():
         raise ValueError(
-            f"{name}: orientation is a reflection{_row(mirrored, 0)} (det = -1); axes "
-            "are x right, y down, z forward"
+            f"{name}: orientation is a reflection{_row(is_mirrored, 0)} (det = -1); "
+            "axes are x right, y down, z forward"
         )
     for field in ("focal_px", "pixel_aspect"):
         value = np.asarray(getattr(camera, field))
@@ -443,12 +443,13 @@ def validate(camera: Camera, size: tuple[int, int], name: str = "camera") -> Non
     _check_range(camera, size, name)
     # Tiles of a large image have it far outside, of another resolution or unit farther.
     center = np.asarray(camera.principal_point_px, np.float64)
-    aside = (np.abs(center / size - 0.5) > MAX_ASIDE).any(axis=-1)
-    if aside.any():
+    is_outside = (np.abs(center / size - 0.5) > MAX_ASIDE).any(axis=-1)
+    if is_outside.any():
         raise ValueError(
-            f"{name}: the principal point {center.reshape(-1, 2)[aside.ravel()][0]} is "
-            f"more than {MAX_ASIDE} images outside {size[0]}x{size[1]}"
-            f"{_row(aside, 0)}; resize the camera with its image"
+            f"{name}: the principal point "
+            f"{center.reshape(-1, 2)[is_outside.ravel()][0]} is more than {MAX_ASIDE} "
+            f"images outside {size[0]}x{size[1]}"
+            f"{_row(is_outside, 0)}; resize the camera with its image"
         )
 
 

@@ -143,9 +143,9 @@ def _bernstein(radial, tangential, slopes):
     radius_sq = x * x + y * y
     powers = radius_sq ** jnp.arange(4, dtype=slopes.dtype)
     radial_terms = jnp.concatenate([jnp.ones_like(radial[:1]), radial]) * powers
-    nothing = jnp.zeros_like(radial_terms)
+    zeros = jnp.zeros_like(radial_terms)
     # In powers of t, along the way and across it: even powers are the radial terms'.
-    across = jnp.stack([radial_terms, nothing], axis=1).reshape(-1)[:-1]
+    across = jnp.stack([radial_terms, zeros], axis=1).reshape(-1)[:-1]
     along = across * jnp.arange(1, 8, dtype=slopes.dtype)
     p1, p2 = tangential[0], tangential[1]
     # The tangential Jacobian at `slopes`, linear in t, in the frame of the way.
@@ -156,61 +156,61 @@ def _bernstein(radial, tangential, slopes):
     ux, uy = jnp.where(radius_sq > 0, x, 1) / length, y / length
     first = ux * ux * xx + 2 * ux * uy * xy + uy * uy * yy
     second = uy * uy * xx - 2 * ux * uy * xy + ux * ux * yy
-    mixed = ux * uy * (yy - xx) + (ux * ux - uy * uy) * xy
+    cross_term = ux * uy * (yy - xx) + (ux * ux - uy * uy) * xy
     along, across = along.at[1].add(first), across.at[1].add(second)
     # Not `jnp.convolve`, which becomes a convolution of as many groups as pixels.
     product = sum(jnp.pad(along[i] * across, (i, 6 - i)) for i in range(7))
-    product = product.at[2].add(-mixed * mixed)
+    product = product.at[2].add(-cross_term * cross_term)
     return exact_product(jnp.asarray(_TO_BERNSTEIN, slopes.dtype), product)
 
 
 @jax.custom_jvp
-def _undistort(radial, tangential, distorted):
-    start = _radial_root(radial, distorted)
+def _undistort(radial, tangential, distorted_xy):
+    start = _radial_root(radial, distorted_xy)
 
     def newton(_, slopes):
         jacobian = _jacobian(radial, tangential, slopes)
-        step = _solve(jacobian, distort(radial, tangential, slopes) - distorted)
+        step = _solve(jacobian, distort(radial, tangential, slopes) - distorted_xy)
         return slopes - step
 
     slopes = lax.fori_loop(0, PLANE_STEPS, newton, start)
     # Where there is no solution Newton wanders to other branches, or to infinity.
-    return jnp.where(_solves(radial, tangential, distorted, slopes), slopes, start)
+    return jnp.where(_solves(radial, tangential, distorted_xy, slopes), slopes, start)
 
 
 @_undistort.defjvp
 def _undistort_jvp(primals, tangents):
-    """Implicit: J ds = d bent - ∂distort/∂(lens) d lens. Same rule at every order."""
-    radial, tangential, distorted = primals
-    radial_dot, tangential_dot, bent_dot = tangents
-    slopes = _undistort(radial, tangential, distorted)
+    """Apply the rule J ds = d distorted - ∂distort/∂(lens) d lens."""
+    radial, tangential, distorted_xy = primals
+    radial_dot, tangential_dot, distorted_dot = tangents
+    slopes = _undistort(radial, tangential, distorted_xy)
     _, tangent = jax.jvp(
         lambda k, p: distort(k, p, slopes),
         (radial, tangential),
         (radial_dot, tangential_dot),
     )
-    step = _solve(_jacobian(radial, tangential, slopes), bent_dot - tangent)
-    return slopes, jnp.where(_solves(radial, tangential, distorted, slopes), step, 0)
+    step = _solve(_jacobian(radial, tangential, slopes), distorted_dot - tangent)
+    return slopes, jnp.where(_solves(radial, tangential, distorted_xy, slopes), step, 0)
 
 
-def _solves(radial, tangential, distorted, slopes):
-    """Test if `slopes` is the wanted root. False for NaN, as comparisons are."""
-    residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - distorted))
+def _solves(radial, tangential, distorted_xy, slopes):
+    """Test if `slopes` is the correct root. False for NaN, as comparisons are."""
+    residual = jnp.max(jnp.abs(distort(radial, tangential, slopes) - distorted_xy))
     bound = (
         RESIDUAL_ULPS
-        * jnp.finfo(distorted.dtype).eps
-        * (1 + jnp.max(jnp.abs(distorted)))
+        * jnp.finfo(distorted_xy.dtype).eps
+        * (1 + jnp.max(jnp.abs(distorted_xy)))
     )
     return (residual <= bound) & one_to_one(radial, tangential, slopes)
 
 
-def _radial_root(radial, distorted):
-    """The root without tangential terms: bisection that Newton shortens.
+def _radial_root(radial, distorted_xy):
+    """Find the root without tangential terms by Newton's method and bisection.
 
-    `beyond` tells on which side of the root (or of the fold, where there is no root) a
-    radius lies, so the bracket always holds the first of the two.
+    `is_beyond` is True outside of the root, or of the fold if there is no root, so the
+    bracket always contains the first of the two.
     """
-    target = jnp.sqrt(jnp.sum(distorted**2))
+    target = jnp.sqrt(jnp.sum(distorted_xy**2))
     k1, k2, k3 = radial[0], radial[1], radial[2]
 
     def narrow(_, state):
@@ -218,18 +218,18 @@ def _radial_root(radial, distorted):
         radius_sq = radius * radius
         stretch = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
         excess = radius * stretch - target
-        unfolded = _is_unfolded(radial, radius_sq)
-        beyond = (excess > 0) | ~unfolded
-        low = jnp.where(beyond, low, radius)
-        high = jnp.where(beyond, radius, high)
+        is_unfolded = _is_unfolded(radial, radius_sq)
+        is_beyond = (excess > 0) | ~is_unfolded
+        low = jnp.where(is_beyond, low, radius)
+        high = jnp.where(is_beyond, radius, high)
         slope = _radial_slope(radial, radius_sq)
-        newton = radius - excess / jnp.where(unfolded, slope, 1)
-        # Newton only while it at least halves its step; it would creep near an
-        # inflection. From an open bracket the search doubles instead of halving.
-        trusted = unfolded & (newton >= low) & (newton <= high)
-        trusted &= jnp.abs(newton - radius) < last / 2
+        newton = radius - excess / jnp.where(is_unfolded, slope, 1)
+        # Newton's method is used while it at least halves its step, because it is slow
+        # near an inflection. Without an upper bound the radius is doubled instead.
+        use_newton = is_unfolded & (newton >= low) & (newton <= high)
+        use_newton &= jnp.abs(newton - radius) < last / 2
         middle = jnp.minimum((low + high) / 2, 2 * low + target)
-        step = jnp.where(trusted, newton, middle)
+        step = jnp.where(use_newton, newton, middle)
         return low, high, step, jnp.abs(step - radius)
 
     low = jnp.zeros_like(target)
@@ -241,7 +241,7 @@ def _radial_root(radial, distorted):
     radius = jnp.where(
         _is_unfolded(radial, (radius / INSIDE) ** 2), radius, INSIDE * radius
     )
-    return distorted * (radius / jnp.where(target > 0, target, 1))
+    return distorted_xy * (radius / jnp.where(target > 0, target, 1))
 
 
 def _radial_slope(radial, radius_sq):

@@ -92,9 +92,9 @@ def one_to_one(
     Returns:
       A boolean scalar.
     """
-    squared = jnp.sum(slopes * slopes)
-    ratio, _ = _arctan_ratio(squared)
-    return _is_unfolded(coefficients, squared * ratio * ratio)
+    slope_sq = jnp.sum(slopes * slopes)
+    ratio, _ = _arctan_ratio(slope_sq)
+    return _is_unfolded(coefficients, slope_sq * ratio * ratio)
 
 
 def stretch(coefficients: Float[Array, "4"], squared: Float[Array, ""]) -> Stretch:
@@ -118,22 +118,22 @@ def stretch(coefficients: Float[Array, "4"], squared: Float[Array, ""]) -> Stret
     return Stretch(ratio * factor, change, along)
 
 
-def _arctan_ratio(squared):
+def _arctan_ratio(slope_sq):
     """θ / tan θ and its derivative as functions of tan² θ."""
-    return jax.jvp(_quarter_series, (squared,), (jnp.ones_like(squared),))
+    return jax.jvp(_quarter_series, (slope_sq,), (jnp.ones_like(slope_sq),))
 
 
-def _quarter_series(squared):
+def _quarter_series(slope_sq):
     """θ / tan θ from the series of a quarter of the angle.
 
     Smooth at zero, without a switch. `jnp.arctan` would be shorter, but XLA:CPU of JAX
     0.10 compiles it to wrong numbers with vectors of 512 bits.
     """
-    first = 1 + jnp.sqrt(1 + squared)  # tan θ over tan θ/2
-    half = squared / (first * first)
+    first = 1 + jnp.sqrt(1 + slope_sq)  # tan θ over tan θ/2
+    half = slope_sq / (first * first)
     second = 1 + jnp.sqrt(1 + half)
     quarter = half / (second * second)
-    series = jnp.zeros_like(squared)
+    series = jnp.zeros_like(slope_sq)
     for coefficient in reversed(_SERIES):
         series = series * quarter + coefficient
     return 4 * series / (first * second)
@@ -149,30 +149,30 @@ def _is_unfolded(coefficients, angle_sq):
 
 
 @jax.custom_jvp
-def _undistort(coefficients, distorted):
-    target = jnp.sqrt(jnp.sum(distorted**2))
+def _undistort(coefficients, distorted_xy):
+    target = jnp.sqrt(jnp.sum(distorted_xy**2))
 
     def narrow(_, state):
         low, high, angle = state
-        distorted, slope = _radius(coefficients, angle)
-        excess = distorted - target
-        beyond = (excess > 0) | (slope <= 0)
-        low, high = jnp.where(beyond, low, angle), jnp.where(beyond, angle, high)
+        distorted_radius, slope = _radius(coefficients, angle)
+        excess = distorted_radius - target
+        is_beyond = (excess > 0) | (slope <= 0)
+        low, high = jnp.where(is_beyond, low, angle), jnp.where(is_beyond, angle, high)
         newton = angle - excess / jnp.where(slope > 0, slope, 1)
         # At the root, rounding alone may lead out of the bracket: `excess` is computed
         # anew, with other roundings, wherever the compiler reads it.
-        inside = jnp.clip(newton, low, high)
-        trusted = (slope > 0) & (jnp.abs(newton - inside) <= OVERSHOOT * angle)
-        return low, high, jnp.where(trusted, inside, (low + high) / 2)
+        in_bracket = jnp.clip(newton, low, high)
+        use_newton = (slope > 0) & (jnp.abs(newton - in_bracket) <= OVERSHOOT * angle)
+        return low, high, jnp.where(use_newton, in_bracket, (low + high) / 2)
 
     # No angle beyond the first fold is searched.
-    angles = jnp.linspace(0, _WIDEST, SEARCHED, dtype=distorted.dtype)
+    angles = jnp.linspace(0, _WIDEST, SEARCHED, dtype=distorted_xy.dtype)
     _, slopes = _radius(coefficients, angles)
     high = jnp.min(jnp.where(slopes <= 0, angles, _WIDEST))
     state = jnp.zeros_like(target), high, jnp.minimum(target, high)
     _, _, angle = lax.fori_loop(0, STEPS, narrow, state)
     radius = jnp.tan(jnp.minimum(angle, high))
-    return distorted * jnp.where(
+    return distorted_xy * jnp.where(
         target > 0, radius / jnp.where(target > 0, target, 1), 1
     )
 
@@ -187,30 +187,30 @@ def _radius(coefficients, angle):
 
 @_undistort.defjvp
 def _undistort_jvp(primals, tangents):
-    """Implicit: J ds = d bent - ∂distort/∂k dk, with J in its radial frame."""
-    coefficients, distorted = primals
-    coefficients_dot, bent_dot = tangents
-    slopes = _undistort(coefficients, distorted)
+    """Apply the rule J ds = d distorted - ∂distort/∂k dk. J is in its radial frame."""
+    coefficients, distorted_xy = primals
+    coefficients_dot, distorted_dot = tangents
+    slopes = _undistort(coefficients, distorted_xy)
     _, tangent = jax.jvp(
         lambda k: distort(k, slopes), (coefficients,), (coefficients_dot,)
     )
-    right = bent_dot - tangent
-    squared = jnp.sum(slopes * slopes)
-    solved = _solves(coefficients, distorted, slopes)
-    ratio, _, along = stretch(coefficients, squared)
-    ratio, along = jnp.where(solved, ratio, 1), jnp.where(solved, along, 1)
+    right = distorted_dot - tangent
+    slope_sq = jnp.sum(slopes * slopes)
+    has_solution = _solves(coefficients, distorted_xy, slopes)
+    ratio, _, along = stretch(coefficients, slope_sq)
+    ratio, along = jnp.where(has_solution, ratio, 1), jnp.where(has_solution, along, 1)
     # 1/ratio across and 1/along along the slopes; both are 1 at the axis.
-    radial = slopes * jnp.sum(slopes * right) / jnp.where(squared > 0, squared, 1)
+    radial = slopes * jnp.sum(slopes * right) / jnp.where(slope_sq > 0, slope_sq, 1)
     step = right / ratio + radial * (1 / along - 1 / ratio)
-    return slopes, jnp.where(solved, step, 0)
+    return slopes, jnp.where(has_solution, step, 0)
 
 
-def _solves(coefficients, distorted, slopes):
-    """Test if `slopes` is the wanted root. False for NaN, as comparisons are."""
-    residual = jnp.max(jnp.abs(distort(coefficients, slopes) - distorted))
+def _solves(coefficients, distorted_xy, slopes):
+    """Test if `slopes` is the correct root. False for NaN, as comparisons are."""
+    residual = jnp.max(jnp.abs(distort(coefficients, slopes) - distorted_xy))
     bound = (
         RESIDUAL_ULPS
-        * jnp.finfo(distorted.dtype).eps
-        * (1 + jnp.max(jnp.abs(distorted)))
+        * jnp.finfo(distorted_xy.dtype).eps
+        * (1 + jnp.max(jnp.abs(distorted_xy)))
     )
     return (residual <= bound) & one_to_one(coefficients, slopes)

@@ -143,8 +143,8 @@ def _angle(difference, twice_product):
     """Compute cosine and sine of the smaller angle that orthogonalizes two columns."""
     size = jnp.abs(difference) + jnp.sqrt(difference**2 + twice_product**2)
     equal = size == 0
-    signed = jnp.where(difference < 0, -twice_product, twice_product)
-    tangent = jnp.where(equal, 0, signed / jnp.where(equal, 1, size))
+    signed_product = jnp.where(difference < 0, -twice_product, twice_product)
+    tangent = jnp.where(equal, 0, signed_product / jnp.where(equal, 1, size))
     cosine = 1 / jnp.sqrt(1 + tangent**2)
     return cosine, cosine * tangent
 
@@ -158,13 +158,13 @@ def _rotate(columns, p, q, cosine, sine):
 def _unit(vector, fallback):
     # Scaled first: in float32 the squares of a column of length 1e-20 are zero.
     scale = power_of_two(functools.reduce(jnp.maximum, map(jnp.abs, vector)))
-    scaled = [v / scale for v in vector]
-    length = jnp.sqrt(dot(scaled, scaled))
+    scaled_vector = [v / scale for v in vector]
+    length = jnp.sqrt(dot(scaled_vector, scaled_vector))
     is_zero = length == 0
     divisor = jnp.where(is_zero, 1, length)
     unit = (
         jnp.where(is_zero, o, v / divisor)
-        for o, v in zip(fallback, scaled, strict=True)
+        for o, v in zip(fallback, scaled_vector, strict=True)
     )
     return tuple(unit), length * scale
 

@@ -69,7 +69,9 @@ class _Pair:
             return self.function(self.settings, residuals, argument)
 
         for mask in self.batched:
-            call = jax.vmap(call, ([0 if batched else None for batched in mask], 0))
+            call = jax.vmap(
+                call, ([0 if is_batched else None for is_batched in mask], 0)
+            )
         *leaves, argument = arrays
         return call(leaves, argument)
 

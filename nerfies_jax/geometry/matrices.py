@@ -75,8 +75,12 @@ def camera_fields(
 def _numbers(name, value, endings):
     array = np.asarray(value)
     if not any(array.shape[max(array.ndim - len(end), 0) :] == end for end in endings):
-        expected = " or ".join(f"[..., {', '.join(map(str, end))}]" for end in endings)
-        raise ValueError(f"{name} has shape {list(array.shape)}, expected {expected}")
+        expected_shape = " or ".join(
+            f"[..., {', '.join(map(str, end))}]" for end in endings
+        )
+        raise ValueError(
+            f"{name} has shape {list(array.shape)}, expected {expected_shape}"
+        )
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be real numbers, got {array.dtype}")
     array = array.astype(np.float64)

@@ -133,8 +133,8 @@ def _singular_values(matrix):
 @_singular_values.defjvp
 def _singular_values_jvp(primals, tangents):
     left, values, right = _orient(False, primals[0])
-    rotated = _between(left, _entries(tangents[0]), right)
-    return jnp.stack(values), jnp.stack([rotated[k][k] for k in range(3)])
+    local_tangent = _between(left, _entries(tangents[0]), right)
+    return jnp.stack(values), jnp.stack([local_tangent[k][k] for k in range(3)])
 
 
 @checked(broadcast=True)
@@ -154,19 +154,19 @@ def svd(matrix: Matrix) -> tuple[Matrix, Float[Array, "3"], Matrix]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _energy(signed, matrix):
-    return _energy_and_gradient(signed, matrix)[0]
+def _energy(is_signed, matrix):
+    return _energy_and_gradient(is_signed, matrix)[0]
 
 
 @_energy.defjvp
-def _energy_jvp(signed, primals, tangents):
-    energy, grad = _energy_and_gradient(signed, primals[0])
+def _energy_jvp(is_signed, primals, tangents):
+    energy, grad = _energy_and_gradient(is_signed, primals[0])
     return energy, jnp.sum(grad * tangents[0])
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _energy_and_gradient(signed, matrix):
-    return _energy_of(*_orient(signed, matrix))
+def _energy_and_gradient(is_signed, matrix):
+    return _energy_of(*_orient(is_signed, matrix))
 
 
 def _energy_of(left, values, right):
@@ -177,19 +177,22 @@ def _energy_of(left, values, right):
 
 
 @_energy_and_gradient.defjvp
-def _energy_and_gradient_jvp(signed, primals, tangents):
+def _energy_and_gradient_jvp(is_signed, primals, tangents):
     """Use divided differences of f' for the symmetric part, sums for the antisymmetric.
 
     This holds for any isotropic energy. See Smith, De Goes and Kim 2019, "Analytic
     eigensystems for isotropic distortion energies".
     """
-    left, values, right = _orient(signed, primals[0])
-    one, other = jnp.stack(values)[:, None], jnp.stack(values)
-    total = jnp.where(jnp.abs(one + other) < CONE, CONE, one + other)
-    twist = (_log_sq_derivative(one) + _log_sq_derivative(other)) / total
-    stretch = _derivative_difference(one, other)
-    rotated = _stack(_between(left, _entries(tangents[0]), right))
-    change = (stretch * (rotated + rotated.T) + twist * (rotated - rotated.T)) / 2
+    left, values, right = _orient(is_signed, primals[0])
+    first, second = jnp.stack(values)[:, None], jnp.stack(values)
+    total = jnp.where(jnp.abs(first + second) < CONE, CONE, first + second)
+    twist = (_log_sq_derivative(first) + _log_sq_derivative(second)) / total
+    stretch = _derivative_difference(first, second)
+    local_tangent = _stack(_between(left, _entries(tangents[0]), right))
+    change = (
+        stretch * (local_tangent + local_tangent.T)
+        + twist * (local_tangent - local_tangent.T)
+    ) / 2
     energy, grad = _energy_of(left, values, right)
     grad_dot = _stack(_outer(left, _entries(change), right))
     return (energy, grad), (jnp.sum(grad * tangents[0]), grad_dot)
@@ -221,13 +224,13 @@ def _strain_energy_of(values, basis):
 @_strain_energy_and_gradient.defjvp
 def _strain_energy_and_gradient_jvp(primals, tangents):
     values, basis = jacobi.eigen(primals[0])
-    rotated = _stack(_between(basis, _entries(tangents[0]), basis))
-    one, other = jnp.stack(values)[:, None], jnp.stack(values)
-    smaller = jnp.minimum(one, other)
-    change = rotated * _log_quotient_difference(
-        jnp.abs(one - other) / (1 + smaller),
+    local_tangent = _stack(_between(basis, _entries(tangents[0]), basis))
+    first, second = jnp.stack(values)[:, None], jnp.stack(values)
+    smaller = jnp.minimum(first, second)
+    change = local_tangent * _log_quotient_difference(
+        jnp.abs(first - second) / (1 + smaller),
         jnp.log1p(smaller),
-        (1 + one) * (1 + other),
+        (1 + first) * (1 + second),
     )
     energy, grad = _strain_energy_of(values, basis)
     grad_dot = _stack(_outer(basis, _entries(change / 2), basis))
@@ -282,10 +285,10 @@ def _log_quotient_difference(excess, log_smaller, product):
     return (quotient - log_smaller) / product
 
 
-def _orient(signed, matrix):
-    """Compute U, σ and V. If not `signed`, U is a reflection for a negative σ3."""
+def _orient(is_signed, matrix):
+    """Compute U, σ and V. If not `is_signed`, U is a reflection for a negative σ3."""
     left, values, right = jacobi.svd(matrix)
-    if signed:
+    if is_signed:
         return left, values, right
     mirror = jnp.where(values[2] < 0, -1, 1).astype(values[2].dtype)
     left = [*left[:2], tuple(mirror * x for x in left[2])]

@@ -108,8 +108,8 @@ def rotate(quaternion: Quaternion, vector: Float[Array, "3"]) -> Float[Array, "3
       The rotated vectors, [..., 3].
     """
     unit = normalize(quaternion)
-    swept = jnp.cross(unit[1:], vector)
-    return vector + 2 * (unit[0] * swept + jnp.cross(unit[1:], swept))
+    product = jnp.cross(unit[1:], vector)
+    return vector + 2 * (unit[0] * product + jnp.cross(unit[1:], product))
 
 
 @checked(broadcast=True)

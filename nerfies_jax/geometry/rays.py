@@ -43,8 +43,8 @@ def pixel_ray(camera: Camera, pixel: Float[Array, "2"]) -> Rays:
     Returns:
       Rays with leading axes [...].
     """
-    direction, converged = cameras.unproject(camera, pixel)
-    return Rays(jnp.asarray(camera.position), direction, converged)
+    direction, has_solution = cameras.unproject(camera, pixel)
+    return Rays(jnp.asarray(camera.position), direction, has_solution)
 
 
 @checked(broadcast=True)

@@ -37,8 +37,8 @@ def stumpff(order: int, angle_sq: Float[Array, "*batch"]) -> Float[Array, "*batc
     near = angle_sq < SERIES_BELOW
     # `where` differentiates both branches, so the unused one must stay finite.
     series = _series(order, jnp.where(near, angle_sq, 0))
-    closed = _closed_form(order, jnp.where(near, SERIES_BELOW, angle_sq))
-    return jnp.where(near, series, closed)
+    closed_form = _closed_form(order, jnp.where(near, SERIES_BELOW, angle_sq))
+    return jnp.where(near, series, closed_form)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
