@@ -145,7 +145,7 @@ def fit_cameras(
     width, height = capture.size
     size = width // factor, height // factor
     # The smaller image does not contain the remaining pixels at the right and bottom.
-    cropped = size[0] * factor, size[1] * factor
+    crop_size = size[0] * factor, size[1] * factor
     program = jax.jit(
         lambda params, step, view, image, valid, depth: _fit_camera(
             model,
@@ -158,7 +158,7 @@ def fit_cameras(
         )
     )
     depth = in_default_precision(np.float32(2 / (1 / capture.near + 1 / capture.far)))
-    cameras, converged = [], []
+    cameras, convergence = [], []
     for row in rows:
         view = view_of(capture, int(row))
         valid = None
@@ -167,7 +167,7 @@ def fit_cameras(
         solution = program(
             state.params,
             state.step,
-            resized(view, cropped, size),
+            resized(view, crop_size, size),
             jnp.asarray(shrink(capture.images[row], factor)),
             valid,
             depth,
@@ -178,12 +178,12 @@ def fit_cameras(
                 position=solution.value.position,
             )
         )
-        converged.append(bool(solution.converged))
-    stacked = jax.tree.map(
+        convergence.append(bool(solution.converged))
+    batch = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *cameras
     )
-    scored = score(draw, state, _with_poses(observed or capture, rows, stacked), rows)
-    return FittedCameras(stacked, np.asarray(converged), scored)
+    scores = score(draw, state, _with_poses(observed or capture, rows, batch), rows)
+    return FittedCameras(batch, np.asarray(convergence), scores)
 
 
 def _camera_renderer(model, state, view, size):
@@ -195,10 +195,10 @@ def _camera_renderer(model, state, view, size):
             ).color
         )
     stages, params = model.stages, state.params
-    deformed = stages.deform(params, stages.prepare(params), view.time)
+    deformation = stages.deform(params, stages.prepare(params), view.time)
     return lambda camera: (
         stages.draw(
-            params, deformed, view._replace(camera=camera), size, state.step
+            params, deformation, view._replace(camera=camera), size, state.step
         ).color
     )
 

@@ -37,13 +37,13 @@ def frames_of(capture: Capture, required_data: Set[str] = frozenset()) -> Frames
     Raises:
       ValueError: If they do not fit in the memory of the device.
     """
-    rows, shared = capture.train, frame_memory.is_shared(capture)
+    rows, is_shared = capture.train, frame_memory.is_shared(capture)
     pixels = _pixels(capture, required_data)
-    if not shared:
+    if not is_shared:
         pixels = {name: array[rows] for name, array in pixels.items()}
     frame_memory.check_device(sum(array.nbytes for array in pixels.values()))
     frames = _without_pixels(capture, required_data)
-    if shared:
+    if is_shared:
         # Unlike `jnp.asarray`, this does not copy the arrays.
         pixels = jax.device_put(pixels)
         frames = frames._replace(image_rows=rows.astype(np.int32))
@@ -91,13 +91,13 @@ def check_frames(model: Model, capture: Capture, training: int = 0) -> None:
 
 
 def _is_streamed(model, capture, training) -> bool:
-    shared = frame_memory.is_shared(capture)
-    count = len(capture.images) if shared else len(capture.train)
+    is_shared = frame_memory.is_shared(capture)
+    count = len(capture.images) if is_shared else len(capture.train)
     pixels = _pixels(capture, model.required_data)
-    needed = sum(count * array[:1].nbytes for array in pixels.values())
+    frame_bytes = sum(count * array[:1].nbytes for array in pixels.values())
     if model.reads is None:
-        frame_memory.check_device(needed)
-    return model.reads is not None and needed > frame_memory.device_limit(training)
+        frame_memory.check_device(frame_bytes)
+    return model.reads is not None and frame_bytes > frame_memory.device_limit(training)
 
 
 def _stream_inputs(model, capture, training):

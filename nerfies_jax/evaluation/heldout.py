@@ -126,21 +126,23 @@ def heldout_metrics(
         "heldout.psnr": known_mean(scored.psnr),
         "heldout.ssim": known_mean(scored.ssim),
     }
-    more = _image_metrics(scored, capture, lpips)
+    optional_scores = _image_metrics(scored, capture, lpips)
     if capture.valid is not None:
-        more["heldout.unscored"] = 1 - capture.valid[scored.rows].mean()
-    more |= _baselines(baselines, scored, capture)
+        optional_scores["heldout.unscored"] = 1 - capture.valid[scored.rows].mean()
+    optional_scores |= _baselines(baselines, scored, capture)
     if capture.depths is not None:
-        more |= _depths(scored, capture)
+        optional_scores |= _depths(scored, capture)
     if known is not None and followed is not None:
         numbers = protocol.score_tracks(known, followed)
-        more |= {_TRACKS[name]: value for name, value in numbers.items()}
-        more["tracks.static_epe"] = protocol.static_error(known)
+        optional_scores |= {_TRACKS[name]: value for name, value in numbers.items()}
+        optional_scores["tracks.static_epe"] = protocol.static_error(known)
     if flow is not None:
-        more |= _flow(flow)
+        optional_scores |= _flow(flow)
     if fitted is not None:
-        more |= _cameras(fitted, capture, exact=known is not None)
-    return scores | {key: float(x) for key, x in more.items() if not np.isnan(x)}
+        optional_scores |= _cameras(fitted, capture, exact=known is not None)
+    return scores | {
+        key: float(x) for key, x in optional_scores.items() if not np.isnan(x)
+    }
 
 
 def metrics(numbers: Mapping[str, float]) -> list[Metric]:
@@ -159,10 +161,10 @@ def metrics(numbers: Mapping[str, float]) -> list[Metric]:
     ]
 
 
-def _image_metrics(scored, capture, lpips):
+def _image_metrics(renders, capture, lpips):
     """Compute means over frames of metrics over the valid, moving or static pixels."""
     values = {}
-    for row, color in zip(scored.rows, scored.color, strict=True):
+    for row, color in zip(renders.rows, renders.color, strict=True):
         valid = None if capture.valid is None else capture.valid[row]
         moving = None if capture.moving is None else capture.moving[row]
         scores = _score(color, capture.images[row], valid, moving)
@@ -176,36 +178,36 @@ def _image_metrics(scored, capture, lpips):
     return {key: known_mean(np.asarray(each)) for key, each in values.items()}
 
 
-def _baselines(baselines, scored, capture):
+def _baselines(baselines, renders, capture):
     """Compute the PSNR of the baselines, and the gain over static renders."""
     numbers = {}
     if baselines.neighbors is not None:
-        psnr = _baseline_psnr(baselines.neighbors, scored, capture)
+        psnr = _baseline_psnr(baselines.neighbors, renders, capture)
         numbers["baseline.neighbor_mean"] = known_mean(psnr[:, 0])
     if baselines.static is not None:
-        psnr = _baseline_psnr(baselines.static, scored, capture)
-        model = baselines.static._replace(color=scored.color[baselines.static.places])
-        gain = _baseline_psnr(model, scored, capture) - psnr
+        psnr = _baseline_psnr(baselines.static, renders, capture)
+        model = baselines.static._replace(color=renders.color[baselines.static.places])
+        gain = _baseline_psnr(model, renders, capture) - psnr
         numbers["baseline.static"] = known_mean(psnr[:, 0])
         numbers["motion.gain"] = known_mean(gain[:, 0])
         numbers["motion.moving_gain"] = known_mean(gain[:, 1])
     return numbers
 
 
-def _baseline_psnr(averages, scored, capture):
+def _baseline_psnr(averages, renders, capture):
     """Compute the PSNR of all valid pixels and of the moving ones, [places, 2]."""
     psnrs = []
     for index, (place, color) in enumerate(
         zip(averages.places, averages.color, strict=True)
     ):
-        row = scored.rows[place]
+        row = renders.rows[place]
         mask = np.ones(color.shape[:2], bool)
         if capture.valid is not None:
             mask &= capture.valid[row]
         if averages.known is not None:
             mask &= averages.known[index]
-        none = np.zeros_like(mask)
-        moving = none if capture.moving is None else mask & capture.moving[row]
+        no_pixels = np.zeros_like(mask)
+        moving = no_pixels if capture.moving is None else mask & capture.moving[row]
         psnrs.append(_masked_psnrs(color, capture.images[row], mask, moving))
     return np.asarray(jax.device_get(psnrs))
 
@@ -253,12 +255,12 @@ def _depth_errors(depth, truth, mask):
 _flow_errors = jax.jit(geometry_quality.flow_errors)
 
 
-def _depths(scored, capture):
+def _depths(renders, capture):
     """Compute depth errors over the known pixels of all frames together."""
-    truth, depth = capture.depths[scored.rows], scored.depth
+    truth, depth = capture.depths[renders.rows], renders.depth
     masks = {"": None}
     if capture.moving is not None:
-        masks["moving_"] = capture.moving[scored.rows]
+        masks["moving_"] = capture.moving[renders.rows]
     numbers = {}
     for name, mask in masks.items():
         valid, errors = _depth_errors(depth, truth, mask)
@@ -273,19 +275,19 @@ def _depths(scored, capture):
 
 def _flow(flow):
     """Compute end-point errors of pixels with a prediction. Others are outliers."""
-    predicted = np.isfinite(flow.predicted).all(axis=-1)
+    has_prediction = np.isfinite(flow.predicted).all(axis=-1)
     flows = in_default_precision((flow.predicted, flow.truth))
 
     def errors(mask=None):
         return _flow_errors(*flows, mask)
 
     numbers = {
-        "flow.epe": errors(predicted).endpoint,
+        "flow.epe": errors(has_prediction).endpoint,
         "flow.outliers": errors().outliers,
-        "flow.missing": 1 - predicted.mean(),
+        "flow.missing": 1 - has_prediction.mean(),
     }
     if flow.moving is not None:
-        numbers["flow.moving_epe"] = errors(predicted & flow.moving).endpoint
+        numbers["flow.moving_epe"] = errors(has_prediction & flow.moving).endpoint
     return numbers
 
 

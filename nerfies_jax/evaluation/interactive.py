@@ -149,14 +149,18 @@ def next_level(
     Returns:
       Index of the level, None if there is nothing to do.
     """
-    expected = [(tile_seconds or 0.0) * 4**level for level in range(levels)]
+    level_seconds = [(tile_seconds or 0.0) * 4**level for level in range(levels)]
     if complete is None:
-        fast = (level for level, each in enumerate(expected) if each <= MOVING_SECONDS)
+        fast = (
+            level
+            for level, seconds in enumerate(level_seconds)
+            if seconds <= MOVING_SECONDS
+        )
         return 0 if tile_seconds is None else max(fast, default=0)
     if moving or complete + 1 == levels:
         return None
     finer = range(complete + 1, levels)
-    fast_levels = [level for level in finer if expected[level] <= SKIPPED_SECONDS]
+    fast_levels = [level for level in finer if level_seconds[level] <= SKIPPED_SECONDS]
     return max(fast_levels, default=complete + 1)
 
 

@@ -37,7 +37,7 @@ class Mesh(NamedTuple):
     colors: np.ndarray  # [vertices, 3] uint8
 
 
-class _Observed(NamedTuple):
+class _Observation(NamedTuple):
     """A rendered pinhole view."""
 
     camera: cameras.Camera
@@ -64,17 +64,17 @@ def extract(
     """
     import skimage.measure
 
-    observed = [_observe(draw, state, view) for view in views]
-    low, high = _bounds(observed)
+    observations = [_observe(draw, state, view) for view in views]
+    low, high = _bounds(observations)
     step = float((high - low).max()) / voxels
     sides = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[axis] + step * np.arange(side) for axis, side in enumerate(sides)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     points = jnp.asarray(grid, jnp.float32)
     total = jnp.zeros((len(points), 6), jnp.float32)
-    with events.stage("fusing depth", len(observed)) as stage:
-        for one in observed:
-            total = _integrate(total, points, one, TRUNCATION * step)
+    with events.stage("fusing depth", len(observations)) as stage:
+        for observation in observations:
+            total = _integrate(total, points, observation, TRUNCATION * step)
             stage.advance()
     sums = np.asarray(total)
     weight, shade = sums[:, 0], sums[:, 2:3]
@@ -108,18 +108,18 @@ def _observe(draw, state, view):
     # A ray that hits nothing passes through free space.
     depth = np.where((alpha >= LEAST_ALPHA) & np.isfinite(depth), depth, np.inf)
     camera = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), view.camera)
-    return _Observed(camera, depth, np.asarray(rendering.color, np.float32))
+    return _Observation(camera, depth, np.asarray(rendering.color, np.float32))
 
 
-def _bounds(observed):
+def _bounds(observations):
     """Corners of the box of the surfaces that the views show."""
     points = []
-    for one in observed:
-        down, right = np.nonzero(np.isfinite(one.depth))
+    for observation in observations:
+        down, right = np.nonzero(np.isfinite(observation.depth))
         sample = np.linspace(0, max(0, len(down) - 1), min(len(down), 2000)).astype(int)
         pixels = np.stack([right[sample], down[sample]], axis=-1) + 0.5
-        depth = one.depth[down, right][sample]
-        points.append(model_flow.surface(one.camera, pixels, depth))
+        depth = observation.depth[down, right][sample]
+        points.append(model_flow.surface(observation.camera, pixels, depth))
     points = np.concatenate(points)
     if not len(points):
         raise ValueError(
@@ -131,15 +131,17 @@ def _bounds(observed):
 
 
 @jax.jit
-def _integrate(total, points, one, truncation):
+def _integrate(total, points, observation, truncation):
     """Add a view to the weighted sums of all points, of distances and of colors."""
-    height, width = one.depth.shape
-    pixel, z = jax.vmap(lambda point: cameras.project(one.camera, point))(points)
+    height, width = observation.depth.shape
+    pixel, z = jax.vmap(lambda point: cameras.project(observation.camera, point))(
+        points
+    )
     place = jnp.floor(pixel)
     size = jnp.asarray([width, height], place.dtype)
     inside = (place >= 0).all(-1) & (place < size).all(-1)
     right, down = jnp.where(inside[:, None], place, 0).astype(int).T
-    depth = one.depth[down, right]
+    depth = observation.depth[down, right]
     distance = depth - z
     # Points behind a surface by more than the truncation are hidden from this view.
     valid = inside & (z > 0) & (distance > -truncation)
@@ -152,7 +154,7 @@ def _integrate(total, points, one, truncation):
     parts = [weight, weight * value, shade]
     parts = [part[:, None] for part in parts]
     return total + jnp.concatenate(
-        [*parts, shade[:, None] * one.color[down, right]], axis=-1
+        [*parts, shade[:, None] * observation.color[down, right]], axis=-1
     )
 
 

@@ -65,12 +65,12 @@ def ranking(
     ]
     starts = [scene[method]["seconds"][0] for scene in scenes for method in methods]
     at = math.inf if seconds is None else max([seconds, *starts])
-    ranked = []
+    candidates = []
     for method in methods:
         preset, *overrides = method.split()
         psnr = statistics.fmean(_psnr_at(scene[method], at) for scene in scenes)
-        ranked.append(Ranked(preset, tuple(overrides), psnr))
-    return sorted(ranked, key=lambda one: one.psnr, reverse=True)
+        candidates.append(Ranked(preset, tuple(overrides), psnr))
+    return sorted(candidates, key=lambda candidate: candidate.psnr, reverse=True)
 
 
 def _psnr_at(curve, seconds):

@@ -178,11 +178,11 @@ def heldout_flow(
     places = np.flatnonzero(visible.any(axis=(1, 2)))
     if not len(places):
         return None
-    predicted, truth, moving = [], [], []
+    predictions, truth, moving = [], [], []
     for place in spread(places, FRAMES):
         row = int(scored.rows[place])
         line, column = spread(np.argwhere(visible[place]), PIXELS).T
-        predicted.append(
+        predictions.append(
             _pixel_flow(
                 move,
                 state,
@@ -196,7 +196,7 @@ def heldout_flow(
         if capture.moving is not None:
             moving.append(capture.moving[row, line, column])
     return Flow(
-        np.concatenate(predicted),
+        np.concatenate(predictions),
         np.concatenate(truth),
         np.concatenate(moving) if moving else None,
     )

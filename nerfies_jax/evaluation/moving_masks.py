@@ -71,7 +71,7 @@ def _candidate_rows(capture):
     overlap (IoU) with the true masks is 0.72 for the first choice (0.79 in training
     frames), and 0.40 for the second, whose frames are four times as far apart.
     """
-    used = np.sort(np.concatenate([capture.train, capture.heldout]))
+    rows = np.sort(np.concatenate([capture.train, capture.heldout]))
     heldout_cameras = np.unique(capture.camera_ids[capture.heldout])
-    same_cameras = used[np.isin(capture.camera_ids[used], heldout_cameras)]
-    return (used,) if len(same_cameras) == len(used) else (used, same_cameras)
+    same_cameras = rows[np.isin(capture.camera_ids[rows], heldout_cameras)]
+    return (rows,) if len(same_cameras) == len(rows) else (rows, same_cameras)

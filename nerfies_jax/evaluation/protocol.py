@@ -112,8 +112,14 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
     if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
     errors = _endpoints(followed.path, known)
-    lost = 1 - followed.converged[_scored_mask(known)].mean()
-    values = (errors.endpoint, errors.correct, lost, followed.drift, followed.strain)
+    lost_share = 1 - followed.converged[_scored_mask(known)].mean()
+    values = (
+        errors.endpoint,
+        errors.correct,
+        lost_share,
+        followed.drift,
+        followed.strain,
+    )
     return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
@@ -134,9 +140,9 @@ def static_error(known: GroundTruth) -> float:
 
 def _scored_mask(truth):
     """Return a mask of the visible points, except at the start."""
-    scored = truth.visible.copy()
-    scored[:, truth.start] = False
-    return scored
+    mask = truth.visible.copy()
+    mask[:, truth.start] = False
+    return mask
 
 
 def _endpoints(path, truth):

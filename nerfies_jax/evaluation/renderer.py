@@ -87,12 +87,14 @@ class Renderer:
             return programs.draw(params, survey, view, step), True
         if self._model.stages is None:
             return programs(params, view, step), True
-        prepared, _ = self._prepared.get(params, None, lambda: programs.prepare(params))
-        timestamp = np.asarray(view.time).tobytes()
-        deformed, is_new = self._deformed.get(
-            params, timestamp, lambda: programs.deform(params, prepared, view.time)
+        preparation, _ = self._prepared.get(
+            params, None, lambda: programs.prepare(params)
         )
-        return programs.draw(params, deformed, view, step), is_new
+        timestamp = np.asarray(view.time).tobytes()
+        deformation, is_new = self._deformed.get(
+            params, timestamp, lambda: programs.deform(params, preparation, view.time)
+        )
+        return programs.draw(params, deformation, view, step), is_new
 
     def ms_per_frame(self, frames: int, cpu: bool = False) -> float:
         """Return the median time of the last frames in milliseconds.
@@ -173,12 +175,14 @@ def _compile_surveyed(model, size, inputs):
     def survey(model, params, step):
         return model.surveyed.survey(params, step)
 
-    def draw(model, params, result_of_survey, view, step):
-        return _float32(model.surveyed.draw(params, result_of_survey, view, size, step))
+    def draw(model, params, survey_output, view, step):
+        return _float32(model.surveyed.draw(params, survey_output, view, size, step))
 
-    surveyed = programs.Program(survey, model).lower(params, step)
-    program = programs.Program(draw, model).lower(params, surveyed.out_info, view, step)
-    return Surveyed(*_compile_all(model, surveyed, program))
+    lowered_survey = programs.Program(survey, model).lower(params, step)
+    lowered_draw = programs.Program(draw, model).lower(
+        params, lowered_survey.out_info, view, step
+    )
+    return Surveyed(*_compile_all(model, lowered_survey, lowered_draw))
 
 
 def _compile_render(model, size, inputs):
@@ -192,15 +196,19 @@ def _compile_render(model, size, inputs):
 def _compile_stages(model, size, inputs):
     params, view, step = inputs
 
-    def draw(model, params, deformed, view, step):
-        return _float32(model.stages.draw(params, deformed, view, size, step))
+    def draw(model, params, deformation, view, step):
+        return _float32(model.stages.draw(params, deformation, view, size, step))
 
-    prepared = programs.Program(programs.prepare, model).lower(params)
-    deformed = programs.Program(programs.deform, model).lower(
-        params, prepared.out_info, view.time
+    lowered_prepare = programs.Program(programs.prepare, model).lower(params)
+    lowered_deform = programs.Program(programs.deform, model).lower(
+        params, lowered_prepare.out_info, view.time
     )
-    program = programs.Program(draw, model).lower(params, deformed.out_info, view, step)
-    return _Programs(*_compile_all(model, prepared, deformed, program))
+    lowered_draw = programs.Program(draw, model).lower(
+        params, lowered_deform.out_info, view, step
+    )
+    return _Programs(
+        *_compile_all(model, lowered_prepare, lowered_deform, lowered_draw)
+    )
 
 
 def _compile_all(model, *lowered):

@@ -124,7 +124,7 @@ class Scoring(NamedTuple):
     validates: Callable[[Spec], bool] = lambda spec: False
 
 
-def _no_variants(spec, metadata, without, blended):
+def _no_variants(spec, metadata, without, blend):
     raise ValueError("this representation defines no variants of a trained scene")
 
 
@@ -160,7 +160,7 @@ class Recommendation(NamedTuple):
     # ({effect: True if needed, None if undecided}, spec) -> overrides that enable or
     # disable effects other than motion
     effect_overrides: Callable[[dict[str, bool | None], Spec], tuple[str, ...]] = (
-        lambda wanted, spec: ()
+        lambda effects, spec: ()
     )
     # By effect, as in `nerfies_jax.preprocessing.findings`.
     prices: Mapping[str, Pair] = MappingProxyType({})

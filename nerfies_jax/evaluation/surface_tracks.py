@@ -74,7 +74,7 @@ def follow(
     line, column = spread(surface, count).T
     pixels = np.stack([column, line], axis=1) + 0.5
     points = model_flow.surface(first_view.camera, pixels, surface_depth[line, column])
-    positions, visible, projected = [], [], []
+    positions, visible, track_pixels = [], [], []
     for row in rows.tolist():
         other_view = view_of(capture, row)
         end = move(state, points, first_view, other_view)
@@ -88,12 +88,12 @@ def follow(
         solid = rendering.alpha[line, column] > MIN_ALPHA
         positions.append(end.points)
         visible.append(end.converged & inside & solid & in_front)
-        projected.append(pixel)
+        track_pixels.append(pixel)
     return SurfaceTracks(
         positions=np.stack(positions, axis=1).astype(np.float32),
         visible=np.stack(visible, axis=1),
         times=times,
-        pixels=np.stack(projected, axis=1).astype(np.float32),
+        pixels=np.stack(track_pixels, axis=1).astype(np.float32),
         rows=rows,
     )
 
