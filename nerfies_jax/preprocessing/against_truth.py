@@ -75,21 +75,21 @@ def errors(capture: Capture, evidence: Evidence, points: TruePoints) -> Errors:
     small = record.downscale(capture, evidence.factor)
     assert small.moving is not None
     true = small.moving[evidence.row]
-    either = (evidence.moving | true).sum()
-    iou = (evidence.moving & true).sum() / either if true.any() else np.nan
-    track_px = lost = path_error = np.nan
+    union = (evidence.moving | true).sum()
+    iou = (evidence.moving & true).sum() / union if true.any() else np.nan
+    track_px = lost_share = path_error = np.nan
     rows = np.flatnonzero(points.visible.any(1))
     if len(rows):
         points = TruePoints(*(part[rows] for part in points))
         views = view_set.in_time_order(small)
         tracks = _tracks_of(views, evidence, points)
-        track_px, lost = _track_error(tracks, points)
+        track_px, lost_share = _track_error(tracks, points)
         path_error = _path_error(capture, views, evidence, tracks, points)
     return Errors(
         mask_iou=float(iou),
         false_share=float((evidence.moving & ~true).mean()),
         track_px=track_px,
-        track_lost=lost,
+        track_lost=lost_share,
         path_error=path_error,
     )
 
@@ -98,8 +98,8 @@ def _tracks_of(views, evidence, points):
     start = points.visible.argmax(1)
     place = points.pixel[np.arange(len(start)), start]
     starts = np.concatenate([start[:, None], place], axis=1)
-    chained = tracking.chain(evidence.flow, starts)
-    return tracking.realigned(chained, dense_flow.leveled(views), views.size)
+    tracks = tracking.chain(evidence.flow, starts)
+    return tracking.realigned(tracks, dense_flow.leveled(views), views.size)
 
 
 def _track_error(tracks: Tracks, points):
@@ -108,14 +108,14 @@ def _track_error(tracks: Tracks, points):
     rows = rows[points.visible[rows, later[rows]]]
     if not len(rows):
         return np.nan, np.nan
-    compared = rows[tracks.visible[rows, later[rows]]]
-    off = (
-        tracks.pixel[compared, later[compared]]
-        - points.pixel[compared, later[compared]]
+    visible_rows = rows[tracks.visible[rows, later[rows]]]
+    offset = (
+        tracks.pixel[visible_rows, later[visible_rows]]
+        - points.pixel[visible_rows, later[visible_rows]]
     )
-    error = np.linalg.norm(off, axis=-1)
+    error = np.linalg.norm(offset, axis=-1)
     median = float(np.median(error)) if len(error) else np.nan
-    return median, 1 - len(compared) / len(rows)
+    return median, 1 - len(visible_rows) / len(rows)
 
 
 def _path_error(capture, views, evidence, tracks, points):

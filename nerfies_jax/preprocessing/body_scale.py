@@ -66,19 +66,19 @@ def from_smoothness(time: np.ndarray, camera: np.ndarray, center: np.ndarray) ->
     def acceleration(place):
         return sum(stencils[:, k, None] * place[k : k + count] for k in range(3))
 
-    known = acceleration(camera)
-    strength = float((known**2).sum())
+    camera_accel = acceleration(camera)
+    strength = float((camera_accel**2).sum())
     distance = float(np.median(np.linalg.norm(center - camera, axis=-1)))
     if not strength > count * (LEAST_ACCELERATION * distance) ** 2:
         return Scale(1.0, np.inf)
     offset = acceleration(center - camera)
-    # The acceleration relative to the factor is `inverse * known + offset`.
-    inverse = -float((known * offset).sum()) / strength
+    # The acceleration relative to the factor is `inverse * camera_accel + offset`.
+    inverse = -float((camera_accel * offset).sum()) / strength
     if not inverse > 0:
         return Scale(1.0, np.inf)
-    rest = inverse * known + offset
-    variance = float((rest**2).sum()) / (3 * count - 1) / strength
-    deviation = np.sqrt(variance * _inflation(known, rest)) / inverse
+    residual = inverse * camera_accel + offset
+    variance = float((residual**2).sum()) / (3 * count - 1) / strength
+    deviation = np.sqrt(variance * _inflation(camera_accel, residual)) / inverse
     return Scale(1 / inverse, float(deviation))
 
 
@@ -116,11 +116,13 @@ def most_likely(
     noise = NOISE * np.median(np.linalg.norm(offset, axis=-1))
     spread = np.zeros(FACTORS)
     for hop in hops:
-        known, moving = (_accelerations(time, place, hop) for place in (camera, offset))
-        rest = known + np.exp(log)[:, None, None] * moving
+        camera_accel, offset_accel = (
+            _accelerations(time, place, hop) for place in (camera, offset)
+        )
+        residual = camera_accel + np.exp(log)[:, None, None] * offset_accel
         # Relative to the factor, so that a small one is not more likely by itself.
-        rest *= np.exp(-log)[:, None, None]
-        covariance = np.einsum("nti,ntj->nij", rest, rest) / len(known)
+        residual *= np.exp(-log)[:, None, None]
+        covariance = np.einsum("nti,ntj->nij", residual, residual) / len(camera_accel)
         covariance += noise**2 * np.eye(3)
         spread += np.linalg.slogdet(covariance)[1] / len(hops)
     cost = 0.5 * independent * spread + 0.5 * (log / deviation) ** 2
@@ -140,14 +142,14 @@ def _accelerations(time, place, hop):
     return np.concatenate(parts)
 
 
-def _inflation(known, rest):
+def _inflation(accel, residual):
     """Return the factor of a variance due to correlations over time (Bartlett 1935)."""
     total = 1.0
-    for lag in range(1, len(known) // 2 + 1):
+    for lag in range(1, len(accel) // 2 + 1):
         product = 1.0
-        for series in (known, rest):
+        for series in (accel, residual):
             power = float((series**2).sum())
-            shifted = float((series[lag:] * series[:-lag]).sum())
-            product *= shifted / power if power > 0 else 0.0
+            autocovariance = float((series[lag:] * series[:-lag]).sum())
+            product *= autocovariance / power if power > 0 else 0.0
         total += 2 * product
     return max(total, 1.0)

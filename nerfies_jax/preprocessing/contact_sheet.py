@@ -28,16 +28,16 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
       uint8 image, [height, width, 3].
     """
     frames = len(views.row)
-    shown = np.unique(np.linspace(0, frames - 1, FOLLOWED).round().astype(int))
+    selection = np.unique(np.linspace(0, frames - 1, FOLLOWED).round().astype(int))
     if evidence.unusable:
-        captions = [f"time {views.time[frame]:.2f}" for frame in shown]
-        return panels.contact_sheet([views.image[f] for f in shown], captions)
+        captions = [f"time {views.time[frame]:.2f}" for frame in selection]
+        return panels.contact_sheet([views.image[f] for f in selection], captions)
     times = -(-DRAWN_WIDTH // views.size[0])
     cells, captions = [], []
-    for frame in shown:
+    for frame in selection:
         mask = evidence.moving[frame]
         image = views.image[frame].astype(float)
-        image = _tinted(image, mask, MOVING, 0.4).round().astype(np.uint8)
+        image = _tint(image, mask, MOVING, 0.4).round().astype(np.uint8)
         image = np.ascontiguousarray(image.repeat(times, 0).repeat(times, 1))
         _draw_tracks(image, evidence, frame, times)
         cells.append(image)
@@ -64,5 +64,5 @@ def _spread(rows, most):
     return rows[:: max(1, -(-len(rows) // most))]
 
 
-def _tinted(image, where, color, share):
-    return np.where(where[..., None], (1 - share) * image + share * color, image)
+def _tint(image, mask, color, share):
+    return np.where(mask[..., None], (1 - share) * image + share * color, image)

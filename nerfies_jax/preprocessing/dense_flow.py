@@ -77,8 +77,8 @@ def leveled(views: Views, times: int | None = None) -> np.ndarray:
     """
     gray = 255 * views.gray
     mean, spread = gray.mean((1, 2)), np.maximum(gray.std((1, 2)), 1e-3)
-    scaled = (gray - mean[:, None, None]) / spread[:, None, None]
-    alike = np.clip(scaled * np.median(spread) + np.median(mean), 0, 255)
+    z_scores = (gray - mean[:, None, None]) / spread[:, None, None]
+    alike = np.clip(z_scores * np.median(spread) + np.median(mean), 0, 255)
     images = [np.rint(image).astype(np.uint8) for image in alike]
     times = enlarged(views) if times is None else times
     return np.stack([larger(image, times) for image in images])
@@ -160,14 +160,14 @@ def dis(times: int) -> Callable[..., np.ndarray]:
     """
     # Two instances, because in OpenCV 4.x a search with an initial flow affects the
     # results of later ones without.
-    plain, guided = (
+    plain, from_guess = (
         cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2)
     )
-    for search in (plain, guided):
+    for search in (plain, from_guess):
         search.setFinestScale(0 if times > 1 else 1)
 
-    def flow(one, other, guess=None):
-        return (plain if guess is None else guided).calc(one, other, guess)
+    def flow(first, second, guess=None):
+        return (plain if guess is None else from_guess).calc(first, second, guess)
 
     return flow
 
@@ -244,7 +244,7 @@ def between_neighbors(
             search_all("second look at wide steps", wide, second_look)
     checked_flow = checked(forward, backward)
     for frame in range(1, frames - 1):
-        if _lost(checked_flow, frame) or _jumps(checked_flow, frame):
+        if _is_lost(checked_flow, frame) or _jumps(checked_flow, frame):
             _continue_motion(checked_flow, frame, images, search)
     return checked_flow
 
@@ -267,7 +267,7 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
     return NeighborFlow(forward, forward_seen, backward, backward_seen)
 
 
-def _lost(flow, frame):
+def _is_lost(flow, frame):
     """Test if a coherent area was tracked to a frame but not beyond it."""
     return _covers_patch(flow.backward_seen[frame] & ~flow.forward_seen[frame])
 

@@ -85,11 +85,11 @@ def common_drift(gain: np.ndarray) -> tuple[float, float]:
       Root mean square of the common gain around its mean, in stops, and its standard
       error in the direction of `DRIFT_STOPS`, from a jackknife over the groups.
     """
-    centered = gain - np.nanmean(gain, axis=1, keepdims=True)
+    offset = gain - np.nanmean(gain, axis=1, keepdims=True)
     count = len(gain)
     products = np.full((count, count), np.nan)
     for first, second in itertools.combinations(range(count), 2):
-        product = centered[first] * centered[second]
+        product = offset[first] * offset[second]
         if np.isfinite(product).any():
             products[first, second] = np.nanmean(product)
     variance = np.nanmedian(products)
@@ -125,9 +125,9 @@ def _sightings(views: Views, points: np.ndarray) -> np.ndarray:
 def _gains(light: np.ndarray) -> np.ndarray:
     """Estimate the gain of each frame by median polish."""
     gain = np.zeros((len(light), 3))
-    observed = np.isfinite(light).all(-1)
-    enough = observed.sum(1) >= MIN_POINTS
-    usable = (observed & enough[:, None]).sum(0) >= 2
+    is_observed = np.isfinite(light).all(-1)
+    enough = is_observed.sum(1) >= MIN_POINTS
+    usable = (is_observed & enough[:, None]).sum(0) >= 2
     light = np.where(enough[:, None, None], light, np.nan)[:, usable]
     if not enough.any() or not usable.any():
         return np.full_like(gain, np.nan)
@@ -142,6 +142,6 @@ def _gains(light: np.ndarray) -> np.ndarray:
 
 def _along_widest(points):
     """Compute coordinates along the direction in which points spread most."""
-    centered = points - np.median(points, axis=0)
-    _, _, axes = np.linalg.svd(centered, full_matrices=False)
-    return centered @ axes[0]
+    offset = points - np.median(points, axis=0)
+    _, _, axes = np.linalg.svd(offset, full_matrices=False)
+    return offset @ axes[0]

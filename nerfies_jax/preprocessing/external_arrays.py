@@ -26,12 +26,12 @@ def frames_of(
     Raises:
       CaptureError: If the number is that of neither.
     """
-    learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    in_time = np.argsort(capture.times, kind="stable")
-    for rows in (learned, in_time):
+    train_rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    all_rows = np.argsort(capture.times, kind="stable")
+    for rows in (train_rows, all_rows):
         if count == len(rows):
             return rows
     raise CaptureError(
-        f"{path}: {what} of {count} frames, but the capture has {len(in_time)} frames "
-        f"({len(learned)} training frames); provide one for each, in temporal order"
+        f"{path}: {what} of {count} frames, but the capture has {len(all_rows)} frames "
+        f"({len(train_rows)} training frames); provide one for each, in temporal order"
     )

@@ -71,34 +71,34 @@ def scaled(
     factor, spread = np.ones(count), np.full(count, prior)
     for group in np.unique(body):
         rows = np.flatnonzero(body == group)
-        both = tracks.visible[rows] & (measured[rows] > 0) & alone.known[rows]
+        is_common = tracks.visible[rows] & (measured[rows] > 0) & alone.known[rows]
         log, weight = 0.0, 1 / prior**2
-        if both.sum() >= FEWEST:
-            ratio = np.log(alone.depth[rows][both] / measured[rows][both])
+        if is_common.sum() >= FEWEST:
+            ratio = np.log(alone.depth[rows][is_common] / measured[rows][is_common])
             video = np.hypot(np.median(alone.depth_deviation[rows]), VIDEO_DEVIATION)
             # Errors of paths beyond a common factor make their median less certain.
             scatter = np.median(np.abs(ratio - np.median(ratio)))
             precision = 1 / (video**2 + scatter**2)
             log = precision * np.median(ratio) / (precision + weight)
             weight += precision
-        hidden = bound[rows][np.isfinite(bound[rows])]
-        if len(hidden) >= FEWEST:
-            log = min(log, np.log(np.quantile(hidden, HIDDEN_SHARE)))
+        limits = bound[rows][np.isfinite(bound[rows])]
+        if len(limits) >= FEWEST:
+            log = min(log, np.log(np.quantile(limits, HIDDEN_SHARE)))
         factor[rows], spread[rows] = np.exp(log), weight**-0.5
     return BodyDepth(measured * factor[:, None], body, factor, spread)
 
 
-def _bodies(tracks, measured, alone):
+def _bodies(tracks, depth, alone):
     """Group tracks by rigid motion. Tracks whose paths are unknown form one body."""
-    body = np.full(len(measured), -1)
+    body = np.full(len(depth), -1)
     rows = np.flatnonzero(alone.known.sum(1) >= FEWEST)
     if len(rows) >= 2 * FEWEST:
-        position, known = alone.position[rows], alone.known[rows]
-        body[rows] = rigid_groups.labels(position, known, GROUPS)
+        position, is_known = alone.position[rows], alone.known[rows]
+        body[rows] = rigid_groups.labels(position, is_known, GROUPS)
     return body
 
 
-def _bounds(views, tracks, measured, static, rest):
+def _bounds(views, tracks, external_depth, static, rest):
     """Largest factors with which tracks are in front of the static points they hide.
 
     Static points that project to a moving track, but are not visible there, are hidden.
@@ -106,17 +106,17 @@ def _bounds(views, tracks, measured, static, rest):
     Returns:
       Ratios of depths [tracks, frames], NaN where no static point is hidden.
     """
-    bound = np.full(measured.shape, np.nan)
+    bound = np.full(external_depth.shape, np.nan)
     stride = -(-len(rest.position) // MOST_POINTS) or 1
     points, visible = rest.position[::stride], static.visible[::stride]
-    for frame in range(measured.shape[1]):
-        here = np.flatnonzero(tracks.visible[:, frame] & (measured[:, frame] > 0))
+    for frame in range(external_depth.shape[1]):
+        here = np.flatnonzero(tracks.visible[:, frame] & (external_depth[:, frame] > 0))
         pixel, depth = project(views, frame, points)
-        hidden = in_image(views, pixel, depth) & ~visible[:, frame]
-        if not len(here) or not hidden.any():
+        is_hidden = in_image(views, pixel, depth) & ~visible[:, frame]
+        if not len(here) or not is_hidden.any():
             continue
-        gap, near = cKDTree(pixel[hidden]).query(tracks.pixel[here, frame])
+        gap, near = cKDTree(pixel[is_hidden]).query(tracks.pixel[here, frame])
         close = gap < NEAR_PX
-        ratio = depth[hidden][near[close]] / measured[here[close], frame]
+        ratio = depth[is_hidden][near[close]] / external_depth[here[close], frame]
         bound[here[close], frame] = ratio
     return bound

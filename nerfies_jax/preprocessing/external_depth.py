@@ -70,7 +70,7 @@ def aligned(
       The aligned depth.
     """
     kinds = (False, True) if inverse is None else (inverse,)
-    results = [_aligned(depth, tracks, rest, kind) for kind in kinds]
+    results = [_align(depth, tracks, rest, kind) for kind in kinds]
     best = results[0]
     for other in results[1:]:
         if other.total_miss + SAME < best.total_miss:
@@ -78,7 +78,7 @@ def aligned(
     return best
 
 
-def _aligned(depth, tracks, rest, inverse):
+def _align(depth, tracks, rest, inverse):
     result = np.full(depth.shape, np.nan, np.float32)
     misses = np.full(len(depth), np.nan)
     fits = []
@@ -102,9 +102,9 @@ def _aligned(depth, tracks, rest, inverse):
             if not (np.isfinite(fit[0]) and fit[0] > 0):
                 continue
         scale, offset, slope = fit
-        mapped = scale * external + offset + np.tensordot(slope, tilt, 1)
-        mapped = np.where(mapped > 0, mapped, np.nan)
-        result[frame] = 1 / mapped if inverse else mapped
+        prediction = scale * external + offset + np.tensordot(slope, tilt, 1)
+        prediction = np.where(prediction > 0, prediction, np.nan)
+        result[frame] = 1 / prediction if inverse else prediction
         error = abs(result[frame][place] / true - 1)
         error = np.where(np.isnan(error), 1.0, error)
         fits.append(error)
@@ -124,16 +124,16 @@ def _tilt(shape):
     return np.stack([columns, rows])
 
 
-def _fit(own, tilt, wanted, precision):
+def _fit(own, tilt, target, precision):
     """Fit scale, offset and tilt from one to the other by robust least squares."""
     size = np.median(np.abs(own)) + 1e-30
     columns = np.stack([own / size, np.ones_like(own), *tilt], axis=1)
     penalty = np.array([0, OFFSET_PENALTY, TILT_PENALTY, TILT_PENALTY])
     weight = np.ones(len(own))
     for _ in range(ROUNDS):
-        weighted = columns * (weight * precision**2)[:, None]
-        matrix = weighted.T @ columns + np.diag(penalty * weight.sum())
-        fit = np.linalg.solve(matrix, weighted.T @ wanted)
-        miss = precision * np.abs(columns @ fit - wanted)
+        weighted_columns = columns * (weight * precision**2)[:, None]
+        matrix = weighted_columns.T @ columns + np.diag(penalty * weight.sum())
+        fit = np.linalg.solve(matrix, weighted_columns.T @ target)
+        miss = precision * np.abs(columns @ fit - target)
         weight = 1 / (1 + (miss / (np.median(miss) + 1e-12)) ** 2)
     return fit[0] / size, fit[1], fit[2:]

@@ -55,8 +55,8 @@ def attached(
     if files.tracks is not None:
         parts |= external_tracks.read(pathlib.Path(files.tracks), capture)
     if files.masks is not None:
-        parts["moving"], more = _masks(files.masks, capture)
-        notes += more
+        parts["moving"], mask_notes = _masks(files.masks, capture)
+        notes += mask_notes
     if files.depths is not None:
         parts["depth"] = _depths(files.depths, capture)
     if files.flow is not None:
@@ -85,9 +85,9 @@ def _files(folder, suffixes, capture, what):
     """Return the files of a folder and their rows, by frame names or by number."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder of {what}; check the path")
-    paths = [one for one in folder.iterdir() if one.suffix.lower() in suffixes]
-    paths.sort(key=lambda one: frames.natural(one.name))
-    by_name = {one.name.partition(".")[0]: one for one in paths}
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
+    paths.sort(key=lambda path: frames.natural(path.name))
+    by_name = {path.name.partition(".")[0]: path for path in paths}
     by_id = [row for row, name in enumerate(capture.ids) if name in by_name]
     if set(capture.train) <= set(by_id):
         return [by_name[capture.ids[row]] for row in by_id], np.array(by_id)
@@ -104,7 +104,7 @@ def _masks(folder, capture):
     encoding = masks.find_encoding(paths)
     for path, row in zip(paths, rows, strict=True):
         mask = masks.read_mask(path, encoding)
-        moving[row] = _fitted(mask, capture, path, "mask")
+        moving[row] = _resample(mask, capture, path, "mask")
     share = moving[rows].mean()
     if share in (0, 1):
         raise CaptureError(
@@ -115,7 +115,7 @@ def _masks(folder, capture):
     return moving, (note,)
 
 
-def _fitted(array, capture, path, what):
+def _resample(array, capture, path, what):
     """Resample an array of the aspect of the images to their size (nearest pixel)."""
     width, height = capture.size
     tall, wide = array.shape[:2]
@@ -136,7 +136,7 @@ def _fitted(array, capture, path, what):
 def _depths(path, capture):
     if path.is_dir():
         paths, rows = _files(path, DEPTHS, capture, "depths")
-        maps = [_depth_map(one) for one in paths]
+        maps = [_depth_map(file) for file in paths]
     else:
         paths, maps = [path], _stack(path)
         rows = external_arrays.frames_of(len(maps), capture, path, "depths")
@@ -150,7 +150,7 @@ def _depths(path, capture):
                 "depth map as the tool wrote it"
             )
         depth = np.where(positive, depth_map, np.nan)
-        depths[row] = _fitted(depth, capture, where, "depth")
+        depths[row] = _resample(depth, capture, where, "depth")
     return depths
 
 
@@ -158,10 +158,10 @@ def _depth_map(path):
     if path.suffix.lower() == ".npy":
         depth_map = npz_files.load_array(path, images.MAX_PIXELS).squeeze()
     elif path.suffix.lower() == ".exr":
-        stored = exr.in_display_window(path, exr.read_exr(path))
-        depth_map = stored.depth
-        if depth_map is None and stored.color is not None:
-            depth_map = stored.color[..., 0]
+        image = exr.in_display_window(path, exr.read_exr(path))
+        depth_map = image.depth
+        if depth_map is None and image.color is not None:
+            depth_map = image.color[..., 0]
     else:
         depth_map = images.read_numbers(path)
     if depth_map is None or depth_map.ndim != 2:
@@ -201,23 +201,23 @@ def _flow(path, capture):
             )
         sides = {side: arrays[side] for side in ("forward", "backward")}
     width, height = capture.size
-    learned = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
-    expected = (len(learned) - 1, height, width, 2)
+    rows = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
+    expected_shape = (len(rows) - 1, height, width, 2)
     for side, array in sides.items():
-        if array.shape != expected or not np.isfinite(array).all():
+        if array.shape != expected_shape or not np.isfinite(array).all():
             raise CaptureError(
-                f"{path}: {side} flow of shape {array.shape}; expected {expected}, "
-                "finite: between consecutive training frames in temporal order, in "
-                "pixels of the images as they are read"
+                f"{path}: {side} flow of shape {array.shape}; expected "
+                f"{expected_shape}, finite: between consecutive training frames in "
+                "temporal order, in pixels of the images as they are read"
             )
     forward, backward = np.zeros((2, len(capture.ids), height, width, 2), np.float32)
-    forward[learned[:-1]], backward[learned[1:]] = sides["forward"], sides["backward"]
+    forward[rows[:-1]], backward[rows[1:]] = sides["forward"], sides["backward"]
     return {"forward": forward, "backward": backward}
 
 
 def _flo_stack(folder):
     paths = _flo_files(folder)
-    fields = [_flo(one) for one in paths]
+    fields = [_flo(file) for file in paths]
     for path, field in zip(paths, fields, strict=True):
         if field.shape != fields[0].shape:
             (height, width), (tall, wide) = field.shape[:2], fields[0].shape[:2]
@@ -229,7 +229,7 @@ def _flo_stack(folder):
 
 
 def _flo_files(folder) -> Sequence[pathlib.Path]:
-    files = sorted(folder.glob("*.flo"), key=lambda one: frames.natural(one.name))
+    files = sorted(folder.glob("*.flo"), key=lambda file: frames.natural(file.name))
     if not files:
         raise CaptureError(
             f"{folder}: no .flo file; both directions are needed, in the folders "

@@ -24,7 +24,7 @@ def flow(external: ExternalResults, views: Views) -> NeighborFlow | None:
     if external.forward is None or external.backward is None:
         return None
     forward, backward = (
-        np.stack([_resized_flow(one, views.size) for one in side[views.row]])
+        np.stack([_resize_flow(shift, views.size) for shift in side[views.row]])
         for side in (external.forward, external.backward)
     )
     return dense_flow.checked(forward, backward)
@@ -42,10 +42,10 @@ def tracks(external: ExternalResults, views: Views) -> Tracks | None:
     """
     if external.track_pixel is None:
         return None
-    return tracking.long_enough(_followed(external, views))
+    return tracking.long_enough(_resample_tracks(external, views))
 
 
-def _followed(external, views):
+def _resample_tracks(external, views):
     scale = np.divide(views.size, external.size, dtype=np.float32)
     pixel = np.moveaxis(external.track_pixel[views.row], 0, 1) * scale
     visible = np.moveaxis(external.track_seen[views.row], 0, 1)
@@ -65,7 +65,7 @@ def moving(external: ExternalResults, views: Views) -> np.ndarray | None:
     if external.moving is None:
         return None
     masks = [
-        _resized(np.float32(one), views.size) for one in external.moving[views.row]
+        _resize(np.float32(mask), views.size) for mask in external.moving[views.row]
     ]
     return np.stack(masks) > 0.5
 
@@ -85,16 +85,16 @@ def depth(external: ExternalResults, views: Views) -> np.ndarray | None:
         return None
     nearest = cv2.INTER_NEAREST
     return np.stack(
-        [_resized(one, views.size, nearest) for one in external.depth[views.row]]
+        [_resize(frame, views.size, nearest) for frame in external.depth[views.row]]
     )
 
 
-def _resized(image, size, how=cv2.INTER_AREA):
+def _resize(image, size, interpolation=cv2.INTER_AREA):
     if image.shape[1::-1] == size:
         return image
-    return cv2.resize(image, size, interpolation=how)
+    return cv2.resize(image, size, interpolation=interpolation)
 
 
-def _resized_flow(shift, size):
+def _resize_flow(shift, size):
     scale = np.divide(size, shift.shape[1::-1], dtype=np.float32)
-    return _resized(shift, size) * scale
+    return _resize(shift, size) * scale

@@ -56,7 +56,7 @@ def read(path: pathlib.Path, capture: Capture) -> dict[str, np.ndarray]:
     """
     pairs = _pairs(path) if path.is_dir() else None
     if pairs is None:
-        pairs = _named(_arrays(path), path)
+        pairs = _select_arrays(_arrays(path), path)
     counts = {len(capture.train), len(capture.ids)}
     pixel, visible = pairs.pixel, pairs.visible
     fits = [axis for axis in (0, 1) if pixel.shape[axis] in counts]
@@ -124,7 +124,7 @@ def _arrays(path):
     return npz_files.load_arrays(path)
 
 
-def _named(arrays, path):
+def _select_arrays(arrays, path):
     name = next((name for name in POSITIONS if name in arrays), None)
     visibility = next((n for n in (*VISIBLE, *OCCLUDED) if n in arrays), None)
     if name is None or visibility is None:

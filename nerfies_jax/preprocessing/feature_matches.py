@@ -69,7 +69,7 @@ def census(views: Views) -> Census:
     features = [_features(views, row) for row in rows]
     points = moving = 0.0
     for here, others in enumerate(_near(views, rows)):
-        matches, moves = _tested(views, rows, features, here, others)
+        matches, moves = _match_features(views, rows, features, here, others)
         # A point is tested again in each view that it is matched in.
         weight = 1 / (1 + matches)
         points += float(weight.sum())
@@ -79,8 +79,8 @@ def census(views: Views) -> Census:
 
 def _features(views, row):
     sift = cv2.SIFT_create(nfeatures=MOST_FEATURES, contrastThreshold=CONTRAST)
-    gray, shown = np.uint8(255 * views.gray[row]), np.uint8(255 * views.valid[row])
-    points, descriptor = sift.detectAndCompute(gray, shown)
+    gray, mask = np.uint8(255 * views.gray[row]), np.uint8(255 * views.valid[row])
+    points, descriptor = sift.detectAndCompute(gray, mask)
     if not points:
         return _Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     pixel = np.array([point.pt for point in points]) + 0.5
@@ -99,17 +99,17 @@ def _near(views, rows):
     return np.argsort(cost, axis=1, kind="stable")[:, 1 : OTHERS + 1]
 
 
-def _tested(views, rows, features, here, others):
-    """Numbers of matches of the tested features of a view, and which of them move."""
+def _match_features(views, rows, features, here, others):
+    """Return match counts of features with enough matches, and which of them move."""
     pixel = features[here].pixel
     if not len(pixel) or not len(others):
         return np.zeros(0), np.zeros(0, bool)
     each = [_matches(features[here], features[other]) for other in others]
     place, strong = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))
-    tested = strong.sum(1) >= LEAST_MATCHES
-    if not tested.any():
+    has_matches = strong.sum(1) >= LEAST_MATCHES
+    if not has_matches.any():
         return np.zeros(0), np.zeros(0, bool)
-    pixel, place, strong = pixel[tested], place[tested], strong[tested]
+    pixel, place, strong = pixel[has_matches], place[has_matches], strong[has_matches]
     start, along = _lines(views, rows[here], rows[others], pixel)
     most = _most_explained(start, along, place, strong)
     alone = most < EXPLAINED * strong.sum(1)

@@ -132,31 +132,31 @@ def table(
     heads = (*narrow_heads, "evidence", "threshold")
     rows = [
         (
-            one.effect,
-            one.decision,
-            one.confidence,
-            costs[one.effect],
-            one.evidence,
-            one.threshold,
+            finding.effect,
+            finding.decision,
+            finding.confidence,
+            costs[finding.effect],
+            finding.evidence,
+            finding.threshold,
         )
-        for one in findings
+        for finding in findings
     ]
     narrow = [max(len(row[i]) for row in (heads, *rows)) for i in range(4)]
     remaining = max(width - sum(narrow) - 10, 40)
     columns = [*narrow, remaining * 3 // 5, remaining * 2 // 5]
     lines = []
     for row in (heads, tuple("-" * column for column in columns), *rows):
-        cells = [_folded(cell, size) for cell, size in zip(row, columns, strict=True)]
+        cells = [_wrap(cell, size) for cell, size in zip(row, columns, strict=True)]
         for line in range(max(len(cell) for cell in cells)):
             parts = [cell[line] if line < len(cell) else "" for cell in cells]
-            padded = (
+            padded_parts = (
                 part.ljust(size) for part, size in zip(parts, columns, strict=True)
             )
-            lines.append("  ".join(padded).rstrip())
+            lines.append("  ".join(padded_parts).rstrip())
     return lines
 
 
-def _folded(text, width):
+def _wrap(text, width):
     lines, line = [], ""
     for word in text.split():
         if line and len(line) + 1 + len(word) > width:

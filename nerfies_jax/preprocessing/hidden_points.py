@@ -44,8 +44,8 @@ def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
     first = len(places)
     frames = np.linspace(0, len(views.row) - 1, min(FRAMES, len(views.row)))
     for frame in np.unique(frames.round().astype(int)).tolist():
-        more, color = _seen_from(views, frame, places, colors, moving[frame])
-        places, colors = np.concatenate([places, more]), np.append(colors, color, 0)
+        place, color = _seen_from(views, frame, places, colors, moving[frame])
+        places, colors = np.concatenate([places, place]), np.append(colors, color, 0)
     return PointCloud(places[first:].astype(np.float32), colors[first:])
 
 
@@ -57,24 +57,24 @@ def _seen_from(views, frame, places, colors, moving):
     at = np.stack([column, row], -1) + 0.5
     pixel, depth = view_set.project(views, frame, places)
     inside = view_set.in_image(views, pixel, depth, 0)
-    none = np.zeros((0, 3)), colors[:0]
+    no_points = np.zeros((0, 3)), colors[:0]
     if not inside.any() or not len(at):
-        return none
+        return no_points
     pixel, inverse, color = pixel[inside], 1 / depth[inside], colors[inside]
-    hidden = cKDTree(pixel).query(at)[0] > cell_px
-    at, row, column = at[hidden], row[hidden], column[hidden]
+    is_hidden = cKDTree(pixel).query(at)[0] > cell_px
+    at, row, column = at[is_hidden], row[is_hidden], column[is_hidden]
     thin = _farthest_in_cells(pixel / cell_px, inverse)
     if len(thin) < AROUND or not len(at):
-        return none
+        return no_points
     pixel, inverse, color = pixel[thin], inverse[thin], color[thin]
     distance, near = cKDTree(pixel).query(at, AROUND)
-    known, offset = inverse[near], pixel[near] - at[:, None]
-    least, most = known.min(1), known.max(1)
+    near_inverse, offset = inverse[near], pixel[near] - at[:, None]
+    least, most = near_inverse.min(1), near_inverse.max(1)
     near_by = weight = 1 / distance**2
     for _ in range(ROUNDS):
-        guess, slope = _plane(offset, known, weight)
+        guess, slope = _plane(offset, near_inverse, weight)
         plane = guess[:, None] + np.einsum("nkc,nc->nk", offset, slope)
-        before = np.maximum(known / np.maximum(plane, least[:, None]) - 1, 0)
+        before = np.maximum(near_inverse / np.maximum(plane, least[:, None]) - 1, 0)
         weight = near_by / (1 + (before / BEFORE) ** 2) ** 2
     ray = view_set.rays(views, frame)[row, column]
     place = views.position[frame] + ray / np.clip(guess, least, most)[:, None]

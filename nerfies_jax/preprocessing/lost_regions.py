@@ -60,7 +60,7 @@ def pairs(views: Views, flow: NeighborFlow) -> list[int]:
         frame
         for frame in range(len(views.row) - 1)
         if wide_steps.is_wide(views, (frame, frame + 1), flow.forward[frame])
-        and max(region.sum() for region in _lost(views, flow, frame)) > least
+        and max(region.sum() for region in _find_regions(views, flow, frame)) > least
     ]
 
 
@@ -82,13 +82,13 @@ def recovered(
     times = images.shape[2] // views.size[0]
     search = dense_flow.dis(times)
     for frame in frames:
-        both = frame, frame + 1
+        frame_pair = frame, frame + 1
         small = (255 * views.gray[frame : frame + 2]).round().astype(np.uint8)
         pair = _Pair(
-            both,
+            frame_pair,
             (images[frame], images[frame + 1]),
             (small[0], small[1]),
-            _lost(views, flow, frame),
+            _find_regions(views, flow, frame),
         )
         for guesses in _affine_flows(views, pair):
             _extend(pair, flow, guesses, search)
@@ -98,7 +98,7 @@ def recovered(
     return flow
 
 
-def _lost(views, flow, frame):
+def _find_regions(views, flow, frame):
     """Return the regions without consistent flow of a frame and of the next one."""
     width = views.size[0]
     narrow, margin = (
@@ -106,12 +106,12 @@ def _lost(views, flow, frame):
         for share in (NARROW_SHARE, 2 * MARGIN_SHARE)
     )
     regions = []
-    for one, consistent in (
+    for index, consistent in (
         (frame, flow.forward_seen[frame]),
         (frame + 1, flow.backward_seen[frame + 1]),
     ):
-        lost = np.uint8(views.textured[one] & ~consistent)
-        wide = cv2.morphologyEx(lost, cv2.MORPH_OPEN, narrow)
+        lost_mask = np.uint8(views.textured[index] & ~consistent)
+        wide = cv2.morphologyEx(lost_mask, cv2.MORPH_OPEN, narrow)
         regions.append(cv2.dilate(wide, margin) > 0)
     return tuple(regions)
 
@@ -119,7 +119,7 @@ def _lost(views, flow, frame):
 def _affine_flows(views, pair):
     """Return the flow in both directions of each group of matches."""
     there, back = (_matches(views, pair, *order) for order in ((0, 1), (1, 0)))
-    one, other = (
+    source, target = (
         np.concatenate([there[0], back[1]]),
         np.concatenate([there[1], back[0]]),
     )
@@ -128,11 +128,11 @@ def _affine_flows(views, pair):
     most = REACH_SHARE * width
     flows = []
     for _ in range(GROUPS):
-        if len(one) < FEWEST_MATCHES:
+        if len(source) < FEWEST_MATCHES:
             break
         affine, inlier = cv2.estimateAffine2D(
-            one,
-            other,
+            source,
+            target,
             ransacReprojThreshold=MISS_SHARE * width,
             maxIters=5000,
             confidence=0.9999,
@@ -146,8 +146,8 @@ def _affine_flows(views, pair):
             ahead = place @ matrix.T + shift
             behind = (place - shift) @ np.linalg.inv(matrix).T
             flows.append([np.clip(at - place, -most, most) for at in (ahead, behind)])
-        rest = inlier.ravel() == 0
-        one, other = one[rest], other[rest]
+        is_left = inlier.ravel() == 0
+        source, target = source[is_left], target[is_left]
     return flows
 
 
@@ -165,21 +165,21 @@ def _block_matches(views, pair, source, target):
         cv2.resize(views.image[pair.frames[at]], size, interpolation=cv2.INTER_AREA)
         for at in (source, target)
     )
-    lost = cv2.resize(np.float32(pair.lost[source]), size, interpolation=cv2.INTER_AREA)
+    mask = cv2.resize(np.float32(pair.lost[source]), size, interpolation=cv2.INTER_AREA)
     half, reach = round(BLOCK_SHARE * size[0] / 2), round(REACH_SHARE * size[0])
     stride = max(round(STRIDE_SHARE * size[0]), 1)
-    padded = cv2.copyMakeBorder(other, *(reach,) * 4, cv2.BORDER_REPLICATE)
+    padded_image = cv2.copyMakeBorder(other, *(reach,) * 4, cv2.BORDER_REPLICATE)
     center, shift = [], []
     for y in range(half, size[1] - half + 1, stride):
         for x in range(half, size[0] - half + 1, stride):
             block = np.s_[y - half : y + half, x - half : x + half]
-            if lost[block].mean() < LEAST_LOST:
+            if mask[block].mean() < LEAST_LOST:
                 continue
             window = np.s_[
                 y - half : y + half + 2 * reach, x - half : x + half + 2 * reach
             ]
             alike = cv2.matchTemplate(
-                padded[window], image[block], cv2.TM_CCOEFF_NORMED
+                padded_image[window], image[block], cv2.TM_CCOEFF_NORMED
             )
             down, right = np.unravel_index(alike.argmax(), alike.shape)
             center.append((x, y))
@@ -196,9 +196,9 @@ def _feature_matches(views, pair, source, target):
         (np.array([point.pt for point in points], float).reshape(-1, 2) + 0.5) / times
         for points, _ in features
     ]
-    none = np.zeros((0, 2))
+    no_matches = np.zeros((0, 2))
     if min(map(len, place)) < 2:
-        return none, none
+        return no_matches, no_matches
     near = cv2.BFMatcher().knnMatch(features[0][1], features[1][1], k=2)
     matches = [
         (best.queryIdx, best.trainIdx)
@@ -206,12 +206,12 @@ def _feature_matches(views, pair, source, target):
         if best.distance < FEATURE_RATIO * second.distance
     ]
     if not matches:
-        return none, none
+        return no_matches, no_matches
     first, second = np.array(matches).T
-    one, other = place[0][first], place[1][second]
+    start, end = place[0][first], place[1][second]
     region = pair.lost[source]
-    is_lost = region[pixel_of(one, region.shape)]
-    return one[is_lost], other[is_lost]
+    is_lost = region[pixel_of(start, region.shape)]
+    return start[is_lost], end[is_lost]
 
 
 def _extend(pair, flow, guesses, search):
@@ -220,11 +220,11 @@ def _extend(pair, flow, guesses, search):
     new = [np.zeros(region.shape, bool) for region in pair.lost]
     for number in range(ROUNDS + 1):
         candidates = [
-            _refined(pair, order, guess, search)
+            _refine(pair, order, guess, search)
             for order, guess in zip(((0, 1), (1, 0)), guesses, strict=True)
         ]
         better = _better(pair, flow, candidates)
-        gain = sum(one.sum() for one in better) / max(area, 1)
+        gain = sum(mask.sum() for mask in better) / max(area, 1)
         if gain < (LEAST_ROUND_GAIN if number else LEAST_GAIN):
             break
         guesses = []
@@ -232,7 +232,7 @@ def _extend(pair, flow, guesses, search):
             shift[better[at]] = candidates[at][better[at]]
             consistent[better[at]] = True
             new[at] |= better[at]
-            guesses.append(_extrapolated(shift, new[at], pair.lost[at]))
+            guesses.append(_extrapolate(shift, new[at], pair.lost[at]))
 
 
 def _sides(flow, frame):
@@ -243,16 +243,16 @@ def _sides(flow, frame):
     )
 
 
-def _refined(pair, order, guess, search):
+def _refine(pair, order, guess, search):
     """Search in the second image, warped by the guess, and add the guess."""
-    one, other = (pair.images[at] for at in order)
-    times = one.shape[1] // guess.shape[1]
+    image, target = (pair.images[at] for at in order)
+    times = image.shape[1] // guess.shape[1]
     guess = dense_flow.enlarged_flow(guess.astype(np.float32), times)
-    rest = search(one, _warped(other, guess))
-    return dense_flow.reduced(rest + _warped(guess, rest), times)
+    correction = search(image, _warp(target, guess))
+    return dense_flow.reduced(correction + _warp(guess, correction), times)
 
 
-def _warped(image, flow):
+def _warp(image, flow):
     height, width = flow.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x + flow[..., 0], y.astype(np.float32) + flow[..., 1]
@@ -267,18 +267,18 @@ def _better(pair, flow, candidates):
         small = pair.small[at], pair.small[1 - at]
         jump = dense_flow.JUMP_SHARE * new.shape[1]
         differs = np.linalg.norm(new - shift, axis=-1) > jump
-        costs = [wide_steps.unlike(small, one) for one in (new, shift)]
+        costs = [wide_steps.unlike(small, candidate) for candidate in (new, shift)]
         replaces = ~consistent | (differs & (costs[0] < BETTER * costs[1]))
         masks.append(pair.lost[at] & dense_flow.closed(new, reverse) & replaces)
     return masks
 
 
-def _extrapolated(flow, known, region):
+def _extrapolate(flow, is_known, region):
     """Extend known flow over a region by a quadratic polynomial."""
-    height, width = known.shape
+    height, width = is_known.shape
     y, x = (np.mgrid[:height, :width] - np.array([[[height]], [[width]]]) / 2) / width
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
-    matrix, values = terms[known], flow[known]
+    matrix, values = terms[is_known], flow[is_known]
     guess = flow.copy()
     if len(values) < 2 * matrix.shape[1]:
         return guess

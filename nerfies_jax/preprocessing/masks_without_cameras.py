@@ -37,23 +37,25 @@ def _moving_masks(images: np.ndarray) -> np.ndarray:
     """
     whole = view_set.without_cameras(images)
     views = view_set.smaller(whole, view_set.times_smaller(whole))
-    leveled = dense_flow.leveled(views)
-    flow = dense_flow.between_neighbors(views, leveled)
-    tracks = tracking.from_flow(views, flow, leveled)
+    gray_images = dense_flow.leveled(views)
+    flow = dense_flow.between_neighbors(views, gray_images)
+    tracks = tracking.from_flow(views, flow, gray_images)
     off = _off_the_camera_motion(tracks, WITHIN_SHARE * views.size[0])
     valid = np.isfinite(off).any(1)
     tracks, off = tracks.take(valid), off[valid]
-    unplaced = np.zeros((len(off), 3)), off, np.zeros_like(off)
-    score = moving.track_scores(tracks, RestPoints(*unplaced))
+    point_fields = np.zeros((len(off), 3)), off, np.zeros_like(off)
+    score = moving.track_scores(tracks, RestPoints(*point_fields))
     share = moving.votes(views, tracks, score)
     moves = moving.mask(views, share, np.zeros_like(share))
     width, height = whole.size
     side = 2 * round(RIM_SHARE * width) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    enlarged = (
-        cv2.resize(one.astype(np.float32), (width, height)) > 0.5 for one in moves
+    full_masks = (
+        cv2.resize(mask.astype(np.float32), (width, height)) > 0.5 for mask in moves
     )
-    return np.stack([cv2.dilate(one.astype(np.uint8), disc) > 0 for one in enlarged])
+    return np.stack(
+        [cv2.dilate(mask.astype(np.uint8), disc) > 0 for mask in full_masks]
+    )
 
 
 @events.stage("detecting moving objects")
@@ -76,7 +78,7 @@ def moving_in(folder: pathlib.Path) -> dict[str, np.ndarray]:
             f"use more than {min(LATER)}"
         )
     images = [image_files.read_image(folder / name)[0] for name in names]
-    sizes = {one.shape for one in images}
+    sizes = {image.shape for image in images}
     if len(sizes) > 1:
         raise ValueError(
             f"{folder}: images of {len(sizes)} sizes; frames of a video must have "
@@ -119,14 +121,14 @@ def _pair_misses(start, end, within):
     if lines is None or lines.shape != (3, 3):
         return by_plane
     by_lines = _sampson(lines, start, end)
-    explained = [(miss < within).sum() for miss in (by_plane, by_lines)]
-    return by_plane if explained[0] > AS_GOOD * explained[1] else by_lines
+    inlier_counts = [(miss < within).sum() for miss in (by_plane, by_lines)]
+    return by_plane if inlier_counts[0] > AS_GOOD * inlier_counts[1] else by_lines
 
 
 def _homography_misses(plane, start, end):
-    mapped = np.c_[start, np.ones(len(start))] @ plane.T
+    homogeneous = np.c_[start, np.ones(len(start))] @ plane.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        miss = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - end, axis=-1)
+        miss = np.linalg.norm(homogeneous[:, :2] / homogeneous[:, 2:] - end, axis=-1)
     return np.nan_to_num(miss, nan=np.inf)
 
 

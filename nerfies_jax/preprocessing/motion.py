@@ -82,7 +82,7 @@ def _flow_fails(views, evidence):
     return rest_noise(evidence) <= CALM_PX and moving_share(evidence) < MOVING_SHARE
 
 
-def _by_features(views, undecided):
+def _by_features(views, finding):
     """Decide that nothing moves if enough features match static points."""
     census = feature_matches.census(views)
     share = census.moving / max(census.points, 1e-9)
@@ -91,7 +91,7 @@ def _by_features(views, undecided):
         f"{share:.1%} move (at most {census.most_moving:.1%} with "
         f"{feature_matches.CONFIDENCE:.0%} confidence)"
     )
-    numbers = undecided.numbers | {
+    numbers = finding.numbers | {
         "feature_points": census.points,
         "feature_moving_share": share,
         "feature_moving_share_most": census.most_moving,
@@ -101,7 +101,7 @@ def _by_features(views, undecided):
         threshold = f"{FEATURES_FOR_NO:.0%} of the features"
         return Finding(EFFECT, text, threshold, False, CERTAIN, numbers)
     return dataclasses.replace(
-        undecided, evidence=f"{undecided.evidence}; {text}", numbers=numbers
+        finding, evidence=f"{finding.evidence}; {text}", numbers=numbers
     )
 
 
@@ -111,25 +111,25 @@ def _threshold():
 
 def _by_tracks(views, evidence):
     shares, share = frame_shares(evidence), moving_share(evidence)
-    masked, noise = float(evidence.moving.mean()), rest_noise(evidence)
+    masked_share, noise = float(evidence.moving.mean()), rest_noise(evidence)
     error = FALSE_SHARE * max(1.0, noise / CALM_PX) ** 2
     moves, confidence = judge(share, MOVING_SHARE, error)
-    lost = _why_not_no(views, evidence, noise) if moves is False else None
-    if lost is not None:
+    reason = _why_not_no(views, evidence, noise) if moves is False else None
+    if reason is not None:
         moves, confidence = None, CANNOT_TELL
     numbers = {
         "moving_share": share,
         "moving_share_most": float(shares.max()),
-        "masked_share": masked,
+        "masked_share": masked_share,
         "noise_px": noise,
     }
     measurement = (
         f"{share:.1%} of the tracks (up to {shares.max():.1%} in a frame) and "
-        f"{masked:.1%} of the pixels are on moving objects; static tracks have a "
+        f"{masked_share:.1%} of the pixels are on moving objects; static tracks have a "
         f"reprojection error of {noise:.2f} px"
     )
-    if lost is not None:
-        measurement += f"; {lost}"
+    if reason is not None:
+        measurement += f"; {reason}"
     speed = speeds(views, evidence) if moves else {}
     if speed:
         numbers |= speed
@@ -190,9 +190,9 @@ def _why_not_no(views, evidence, noise):
     frames = len(views.row)
     if frames < MIN_FOR_NO:
         return f"fast motion cannot be tracked in {frames} frames"
-    matched = record.carried(views, evidence.flow)
-    if matched < CARRIED_FOR_NO:
-        return f"fast objects may be in the {1 - matched:.0%} of pixels without flow"
+    flow_share = record.carried(views, evidence.flow)
+    if flow_share < CARRIED_FOR_NO:
+        return f"fast objects may be in the {1 - flow_share:.0%} of pixels without flow"
     if evidence.moving.mean() > MASKED_FOR_NO:
         return "pixels that differ from the static scene may be too fast for tracking"
     return None

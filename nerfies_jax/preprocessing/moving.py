@@ -133,7 +133,7 @@ def may_move(share: np.ndarray) -> np.ndarray:
     size = 2 * round(RIM_PX * image_scale(share.shape[2])) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     seeds = (share > OPEN).astype(np.uint8)
-    return np.stack([cv2.dilate(one, disc) > 0 for one in seeds])
+    return np.stack([cv2.dilate(seed, disc) > 0 for seed in seeds])
 
 
 def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
@@ -150,9 +150,9 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
     share = np.clip(share, SUREST, 1 - SUREST)
     total = np.log(share / (1 - share)) + odds
     moving = np.zeros(total.shape, bool)
-    for frame, one in enumerate(total):
+    for frame, log_odds in enumerate(total):
         color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        moving[frame] = _smooth(one.astype(np.float32), color) > 0
+        moving[frame] = _smooth(log_odds.astype(np.float32), color) > 0
     return moving
 
 

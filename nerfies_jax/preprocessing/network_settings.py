@@ -53,9 +53,9 @@ class NetworkSettings:
         _check(self.kind in kinds, "kind", self.kind, "one of " + ", ".join(kinds[1:]))
 
 
-def _check(fits, name, value, wanted):
+def _check(fits, name, value, requirement):
     if not fits:
-        raise ValueError(f"{name}={value!r} of a network; it must be {wanted}")
+        raise ValueError(f"{name}={value!r} of a network; it must be {requirement}")
 
 
 def read(path: pathlib.Path, metadata: Mapping[str, str]) -> NetworkSettings:
@@ -110,18 +110,18 @@ def _object(file):
     return content
 
 
-def _of_preprocessor(stored):
+def _of_preprocessor(config):
     """Settings of the preprocessor_config.json of Hugging Face's transformers."""
     fields: dict[str, Any] = {}
-    if stored.get("do_rescale", True) and "rescale_factor" in stored:
-        fields["scale"] = stored["rescale_factor"]
-    if stored.get("do_normalize", True) is False:
+    if config.get("do_rescale", True) and "rescale_factor" in config:
+        fields["scale"] = config["rescale_factor"]
+    if config.get("do_normalize", True) is False:
         fields |= {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
     for name, other in (("mean", "image_mean"), ("std", "image_std")):
-        if name not in fields and isinstance(stored.get(other), list):
-            fields[name] = stored[other]
-    if isinstance(stored.get("ensure_multiple_of"), int):
-        fields["multiple"] = stored["ensure_multiple_of"]
+        if name not in fields and isinstance(config.get(other), list):
+            fields[name] = config[other]
+    if isinstance(config.get("ensure_multiple_of"), int):
+        fields["multiple"] = config["ensure_multiple_of"]
     return fields
 
 

@@ -75,7 +75,7 @@ def depths(
       CaptureError: If the network cannot be run, or its output is no depth.
       MissingExtra: If ONNX Runtime is not installed.
     """
-    network = _described(path, settings)
+    network = _read_network(path, settings)
     result = np.full(capture.images.shape[:3], np.nan, np.float32)
 
     def depth_of(output, row):
@@ -94,7 +94,7 @@ def depths(
         # The offset is arbitrary, but aligned depth is expected to be positive.
         return output - min(0.0, float(output.min()))
 
-    for row, depth in _cached(capture, network, depth_of, folder):
+    for row, depth in _read_or_compute(capture, network, depth_of, folder):
         result[row] = cv2.resize(depth, capture.size, interpolation=cv2.INTER_LINEAR)
     inverse = {"depth": False, "inverse depth": True}.get(network.settings.kind)
     return Depths(result, inverse)
@@ -123,15 +123,15 @@ def segments(
       CaptureError: If the network cannot be run, or its output is no segmentation.
       MissingExtra: If ONNX Runtime is not installed.
     """
-    network = _described(path, settings)
+    network = _read_network(path, settings)
     result = np.zeros(capture.images.shape[:3], bool)
 
     def share_of(output, _):
         return _share(output, network)
 
-    for row, share in _cached(capture, network, share_of, folder):
-        resized = cv2.resize(share, capture.size, interpolation=cv2.INTER_LINEAR)
-        result[row] = resized > network.settings.threshold
+    for row, share in _read_or_compute(capture, network, share_of, folder):
+        full_share = cv2.resize(share, capture.size, interpolation=cv2.INTER_LINEAR)
+        result[row] = full_share > network.settings.threshold
     return result
 
 
@@ -174,7 +174,7 @@ def _logits(values, settings):
     return bool(((values < 0) | (values > 1)).any())
 
 
-def _described(
+def _read_network(
     path: pathlib.Path | str, settings: NetworkSettings | None = None
 ) -> Network:
     """Read how to run a network."""
@@ -182,7 +182,7 @@ def _described(
     path = pathlib.Path(path).absolute()
     if not path.is_file():
         raise CaptureError(f"{path}: no such file of a network; check the path")
-    with _reported(path), decoder.session() as child:
+    with _report_errors(path), decoder.session() as child:
         about = child.request(
             "network_header", CPU_SECONDS, _memory(path), path=str(path)
         ).about
@@ -190,16 +190,16 @@ def _described(
         settings = network_settings.read(path, about["metadata"])
     inputs, outputs = about["inputs"], about["outputs"]
     if len(inputs) != 1 or len(inputs[0][2]) != 4:
-        listed = ", ".join(f"{name} {shape}" for name, _, shape in inputs)
+        input_list = ", ".join(f"{name} {shape}" for name, _, shape in inputs)
         raise CaptureError(
-            f"{path}: its inputs are {listed or 'none'}; expected one image, [1, 3, "
-            "height, width] or [1, height, width, 3]"
+            f"{path}: its inputs are {input_list or 'none'}; expected one image, "
+            "[1, 3, height, width] or [1, height, width, 3]"
         )
     name, kind, shape = inputs[0]
     channels_last = shape[1] != 3 and shape[3] == 3
-    accepted = ("tensor(float)", "tensor(float16)", "tensor(double)", "tensor(uint8)")
+    types = ("tensor(float)", "tensor(float16)", "tensor(double)", "tensor(uint8)")
     batch_fits = not isinstance(shape[0], int) or shape[0] == 1
-    if (shape[1] != 3 and not channels_last) or not batch_fits or kind not in accepted:
+    if (shape[1] != 3 and not channels_last) or not batch_fits or kind not in types:
         raise CaptureError(
             f"{path}: its input {name} is {kind} {shape}; expected one color image, "
             "[1, 3, height, width] or [1, height, width, 3]"
@@ -226,7 +226,7 @@ def _memory(path):
 
 
 @contextlib.contextmanager
-def _reported(path):
+def _report_errors(path):
     """Report errors of the child with the path of the network."""
     try:
         yield
@@ -237,7 +237,7 @@ def _reported(path):
         ) from None
 
 
-def _cached(capture, network, result_of, folder):
+def _read_or_compute(capture, network, result_of, folder):
     """Yield training frames and their results, from a cache if they are there."""
     identity = f"network {VERSION} {_digest(capture, network)}"
     path = folder / f"{identity.rpartition(' ')[2]}.npz"
@@ -254,7 +254,7 @@ def _cached(capture, network, result_of, folder):
 
 
 def _results(capture, network, result_of):
-    small = _sized(capture, network)
+    small = _resize_images(capture, network)
     settings = network.settings
     normalization = {
         "scale": settings.scale,
@@ -264,7 +264,7 @@ def _results(capture, network, result_of):
     }
     with (
         tempfile.TemporaryDirectory() as scratch,
-        _reported(network.path),
+        _report_errors(network.path),
         decoder.streaming() as child,
         events.stage(f"running {network.path.name}", len(small)) as stage,
     ):
@@ -286,8 +286,8 @@ def _results(capture, network, result_of):
             stage.advance()
 
 
-def _sized(capture, network):
-    """Training images in the size of the input, uint8."""
+def _resize_images(capture, network):
+    """Resize training images to the size of the input, as uint8."""
     width, height = capture.size
     size = network.size
     if size is None:
@@ -295,10 +295,10 @@ def _sized(capture, network):
         size = tuple(
             max(1, round(side * part / multiple)) * multiple for side in capture.size
         )
-    how = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
+    interpolation = cv2.INTER_AREA if size[0] < width else cv2.INTER_CUBIC
     return np.stack(
         [
-            cv2.resize(capture.images[row], size, interpolation=how)
+            cv2.resize(capture.images[row], size, interpolation=interpolation)
             for row in capture.train
         ]
     )

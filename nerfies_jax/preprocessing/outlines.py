@@ -55,7 +55,7 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
     """
     threshold = f"{BARE_SHARE:.0%} of the outlines not explained by a static object"
     box = _box(views, shapes)
-    bare = np.array([]) if box is None else _uncovered(views, shapes, box)
+    bare = np.array([]) if box is None else _measure_uncovered(views, shapes, box)
     if not bare.size:
         return cannot_tell(EFFECT, "the outlines have no common volume", "")
     value = float(bare.mean())
@@ -72,7 +72,7 @@ def motion(views: Views, shapes: np.ndarray) -> Finding:
     return Finding(EFFECT, evidence, threshold, moves, confidence, numbers)
 
 
-def _uncovered(
+def _measure_uncovered(
     views: Views, shapes: np.ndarray, box: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
     """Compute the share of each silhouette that the visual hull does not fill.
@@ -85,25 +85,25 @@ def _uncovered(
     counts = np.maximum(np.ceil((high - low) / side).astype(int), 1)
     axes = [low[i] + (np.arange(counts[i]) + 0.5) * side for i in range(3)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    wide = [nd.binary_dilation(one, iterations=SLACK_PX) for one in shapes]
+    wide = [nd.binary_dilation(mask, iterations=SLACK_PX) for mask in shapes]
     for index, shape in enumerate(wide):
         place, inside = _pixels(views, index, cells)
         hit = shape[tuple(place[:, ::-1].T)]
         cells = cells[hit | ~inside]
     shares = []
     for index, shape in enumerate(shapes):
-        needed = nd.binary_erosion(shape, iterations=SLACK_PX)
+        eroded_shape = nd.binary_erosion(shape, iterations=SLACK_PX)
         place, inside = _pixels(views, index, cells)
-        filled = np.zeros_like(shape)
-        filled[tuple(place[inside, ::-1].T)] = True
+        hull_mask = np.zeros_like(shape)
+        hull_mask[tuple(place[inside, ::-1].T)] = True
         # Dilated by the width of a cell in pixels.
         depth = np.linalg.norm(views.position[index] - (low + high) / 2)
         width = side * views.intrinsics[index][0, 0] / depth
-        filled = nd.binary_dilation(
-            filled, np.ones((3, 3)), iterations=max(1, int(np.ceil(width / 2)))
+        hull_mask = nd.binary_dilation(
+            hull_mask, np.ones((3, 3)), iterations=max(1, int(np.ceil(width / 2)))
         )
-        if needed.any():
-            shares.append((needed & ~filled).sum() / needed.sum())
+        if eroded_shape.any():
+            shares.append((eroded_shape & ~hull_mask).sum() / eroded_shape.sum())
     return np.array(shares)
 
 

@@ -78,11 +78,11 @@ def align(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Tracks:
       Baker and Matthews 2004.
     """
     for _ in range(PASSES):
-        tracks = _aligned(tracks, images, images.shape[2] // size[0])
+        tracks = _align_once(tracks, images, images.shape[2] // size[0])
     return tracks
 
 
-def _aligned(tracks, images, times):
+def _align_once(tracks, images, times):
     """Align tracks once, in images enlarged `times` times."""
     patches = _patches(tracks, images, times)
     pixel, visible = tracks.pixel.copy(), tracks.visible.copy()
@@ -116,7 +116,7 @@ def _grid(reach):
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def _sampled(image, place):
+def _sample(image, place):
     """Interpolate an image at positions (x, y), [points, pixels]."""
     x, y = np.moveaxis(place.astype(np.float32), -1, 0)
     return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -130,7 +130,7 @@ def _patches(tracks, images, times):
         rows = tracks.start == start
         center = tracks.pixel[rows, start] * times - 0.5
         image = images[start].astype(np.float32)
-        value[rows] = _sampled(image, center[:, None] + _grid(reach + 1))
+        value[rows] = _sample(image, center[:, None] + _grid(reach + 1))
     value = value.reshape(points, side, side)
     right = 0.5 * (value[:, 1:-1, 2:] - value[:, 1:-1, :-2])
     down = 0.5 * (value[:, 2:, 1:-1] - value[:, :-2, 1:-1])
@@ -152,7 +152,7 @@ def _search(image, patches, warp, guess, times):
     inverse_warp = np.linalg.inv(warp)
     for _ in range(ROUNDS):
         at = place[active]
-        error = _sampled(image, at[:, None].astype(np.float32) + offset[active])
+        error = _sample(image, at[:, None].astype(np.float32) + offset[active])
         error -= patches.value[active]
         slope = error[:, None] @ patches.gradient[active]
         away = (at - guess[active])[:, None] @ inverse_warp[active]
@@ -164,7 +164,7 @@ def _search(image, patches, warp, guess, times):
             break
     is_far = np.linalg.norm(place - guess, axis=-1) > STEP_PX * times
     place[is_far] = guess[is_far]
-    value = _sampled(image, place[:, None] + offset)
+    value = _sample(image, place[:, None] + offset)
     return place, _are_alike(value, patches.value)
 
 
@@ -179,16 +179,16 @@ def _are_alike(value, other):
 
 def _neighbors(tracks, rows, start, frame):
     """Return the tracks that are nearest to some of the same start in its frame."""
-    both = np.flatnonzero(tracks.visible[:, start] & tracks.visible[:, frame])
-    if len(both) <= FEWEST:
+    common = np.flatnonzero(tracks.visible[:, start] & tracks.visible[:, frame])
+    if len(common) <= FEWEST:
         return Neighbors(rows, *np.zeros((2, len(rows), 0, 2)))
     before, after = (
         tracks.pixel[:, each].astype(np.float64) for each in (start, frame)
     )
-    wanted = min(NEIGHBORS, len(both) - 1)
-    _, near = cKDTree(before[both]).query(before[rows], wanted + 1)
-    source = before[both[near]] - before[rows, None]
-    target = after[both[near]] - after[rows, None]
+    count = min(NEIGHBORS, len(common) - 1)
+    _, near = cKDTree(before[common]).query(before[rows], count + 1)
+    source = before[common[near]] - before[rows, None]
+    target = after[common[near]] - after[rows, None]
     return Neighbors(rows, source, target)
 
 
@@ -232,11 +232,11 @@ def _similarities(weight, source, target):
 
 def _affine(weight, source, target, similar):
     """Return linear maps from source to target near the similarities, [rows, 2, 2]."""
-    weighted = weight[..., None] * source
-    gram = source.swapaxes(1, 2) @ weighted
-    both = target.swapaxes(1, 2) @ weighted
+    weighted_source = weight[..., None] * source
+    gram = source.swapaxes(1, 2) @ weighted_source
+    cross = target.swapaxes(1, 2) @ weighted_source
     prior = 0.5 * SIMILAR * np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-9
-    return (both + prior * similar) @ np.linalg.inv(gram + prior * np.eye(2))
+    return (cross + prior * similar) @ np.linalg.inv(gram + prior * np.eye(2))
 
 
 def _robust_weights(warp, source, target):

@@ -60,8 +60,8 @@ def known(
         exact = np.zeros(len(views.row))
         return AlignedDepth(capture.depths[views.row], exact, 0.0)
     tracks, rest = _well_placed(views, *static)
-    aligned = external_depth.aligned(depth, tracks, rest, external.inverse)
-    miss, name = aligned.total_miss, capture.path or capture.name
+    aligned_depth = external_depth.aligned(depth, tracks, rest, external.inverse)
+    miss, name = aligned_depth.total_miss, capture.path or capture.name
     if not np.isfinite(miss):
         kinds = {
             None: "neither as depth nor as inverse depth",
@@ -78,7 +78,7 @@ def known(
             f"{miss:.0%} (median), more than {external_depth.USABLE:.0%}; check that "
             "they belong to these frames, or remove them"
         )
-    return aligned
+    return aligned_depth
 
 
 def _well_placed(views, tracks, rest):
@@ -126,32 +126,32 @@ def fitted(
         return rigid_bodies.refined_short(views, moving, alone, least_known, has_room)
     if depths is None:
         return rigid_bodies.refined(views, moving, alone, has_room)
-    measured = _measured(depths.depth, moving)
+    track_depth = _measure_depth(depths.depth, moving)
     deviation = depths.deviation(paths.MEASURED_DEVIATION)
     if capture.external is None or capture.external.depth is None:
         return paths.least_acceleration(
-            views, moving, least, around, measured, deviation
+            views, moving, least, around, track_depth, deviation
         )
     watch.spend(1e-6 * A_PATH_FRAME * moving.visible.size)
     miss = external_depth.PER_MEDIAN * depths.total_miss
     near, rest = _well_placed(views, *static)
-    bodies = external_bodies.scaled(views, moving, measured, alone, near, rest, miss)
+    bodies = external_bodies.scaled(views, moving, track_depth, alone, near, rest, miss)
     smooth = paths.least_acceleration(
         views, moving, least, around, bodies.depth, deviation
     )
-    refined = rigid_bodies.refined(views, moving, smooth, has_room)
-    return refined._replace(depth_deviation=bodies.deviation)
+    refined_paths = rigid_bodies.refined(views, moving, smooth, has_room)
+    return refined_paths._replace(depth_deviation=bodies.deviation)
 
 
-def _measured(depths, tracks):
+def _measure_depth(depths, tracks):
     """Return z-depths of tracks, NaN if unknown or at a depth discontinuity."""
-    measured = np.full(tracks.visible.shape, np.nan)
+    track_depth = np.full(tracks.visible.shape, np.nan)
     for frame, depth_map in enumerate(depths):
         rows = np.flatnonzero(tracks.visible[:, frame])
         depth = _steady_depth(depth_map)
         at = tracking.pixel_of(tracks.pixel[rows, frame], depth.shape)
-        measured[rows, frame] = depth[at]
-    return measured
+        track_depth[rows, frame] = depth[at]
+    return track_depth
 
 
 def _steady_depth(depth: np.ndarray, jump: float = 0.06) -> np.ndarray:

@@ -88,10 +88,10 @@ def least_acceleration(
             usable = tracks.visible & np.isfinite(depth)
             pull = np.where(usable, (noise / deviation) ** 2, pull)
             target = np.where(usable, depth, target)
-    wanted = _Wanted(ray, tracks.visible, pull, target)
+    problem = _Problem(ray, tracks.visible, pull, target)
     some = slice(None, None, -(-len(ray) // TRIED) or 1)
-    penalty = _penalty(views, _Wanted(*(part[some] for part in wanted)), noise)
-    position, flatness = _fitted(views, wanted, penalty, noise)
+    penalty = _penalty(views, _Problem(*(part[some] for part in problem)), noise)
+    position, flatness = _fit(views, problem, penalty, noise)
     return certain(views, tracks, position, near)._replace(depth_deviation=flatness)
 
 
@@ -113,7 +113,7 @@ def certain(views: Views, tracks: Tracks, position: np.ndarray, near: float) -> 
     return Paths(position, usable, depth, np.zeros(count), np.zeros(count, bool))
 
 
-class _Wanted(NamedTuple):
+class _Problem(NamedTuple):
     """Rays and depths that paths should pass through."""
 
     ray: np.ndarray  # [tracks, frames, 3] with z-depth one
@@ -122,41 +122,41 @@ class _Wanted(NamedTuple):
     depth: np.ndarray  # [tracks, frames] target z-depth
 
 
-def _penalty(views, wanted, noise):
+def _penalty(views, problem, noise):
     """Return the largest penalty with which half of the paths fit within the noise."""
     penalty = LEAST_PENALTY
-    while 10 * penalty <= MOST_PENALTY and len(wanted.ray):
-        position, _ = _fitted(views, wanted, 10 * penalty, noise)
-        sine = np.cross(position - views.position, wanted.ray)
-        for side in (position - views.position, wanted.ray):
+    while 10 * penalty <= MOST_PENALTY and len(problem.ray):
+        position, _ = _fit(views, problem, 10 * penalty, noise)
+        sine = np.cross(position - views.position, problem.ray)
+        for side in (position - views.position, problem.ray):
             sine /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), NO_DEPTH)
-        squared = np.where(wanted.visible, (sine**2).sum(-1), 0).sum(1)
-        if np.median(np.sqrt(squared / wanted.visible.sum(1))) > noise:
+        error_sq = np.where(problem.visible, (sine**2).sum(-1), 0).sum(1)
+        if np.median(np.sqrt(error_sq / problem.visible.sum(1))) > noise:
             break
         penalty *= 10
     return penalty
 
 
-def _fitted(views, wanted, penalty, noise):
+def _fit(views, problem, penalty, noise):
     """Return positions, and deviations of their depths."""
-    length = np.linalg.norm(wanted.ray, axis=-1)
-    unit = wanted.ray / length[..., None]
-    position = np.full((*wanted.visible.shape, 3), np.nan)
-    flatness = np.full(len(wanted.visible), np.inf)
-    for row, visible in enumerate(wanted.visible):
+    length = np.linalg.norm(problem.ray, axis=-1)
+    unit = problem.ray / length[..., None]
+    position = np.full((*problem.visible.shape, 3), np.nan)
+    flatness = np.full(len(problem.visible), np.inf)
+    for row, visible in enumerate(problem.visible):
         first, last = np.flatnonzero(visible)[[0, -1]]
         span = slice(first, last + 1)
         stencils = np.sqrt(penalty) * second_differences(views.time[span])
         along = unit[row, span]
-        weight, pulled = visible[span].astype(float), wanted.pull[row, span]
+        weight, pull = visible[span].astype(float), problem.pull[row, span]
         across = across_ray(along)
         onto = np.eye(3) - across
-        blocks = weight[:, None, None] * across + pulled[:, None, None] * onto
+        blocks = weight[:, None, None] * across + pull[:, None, None] * onto
         camera = views.position[span]
-        place = camera + wanted.ray[row, span] * wanted.depth[row, span, None]
+        place = camera + problem.ray[row, span] * problem.depth[row, span, None]
         right = weight[:, None] * np.einsum("fij,fj->fi", across, camera)
-        right += pulled[:, None] * np.einsum("fij,fj->fi", onto, place)
-        path = _solved(blocks, _bands(stencils, len(along)), right)
+        right += pull[:, None] * np.einsum("fij,fj->fi", onto, place)
+        path = _solve(blocks, _bands(stencils, len(along)), right)
         position[row, span] = path
         # Offsets from the cameras replace rays, which invisible frames do not have.
         offset = path - camera
@@ -182,9 +182,9 @@ def _deviation(stencils, path, offset, miss):
         parts = (stencils[:, k, None] * place[k : k + count] for k in range(3))
         return (sum(parts) ** 2).sum(-1).mean()
 
-    hidden = squared_bend(path) + miss**2 / len(stencils)
-    shown = squared_bend(offset)
-    return np.sqrt(hidden / shown) if shown > 0 else np.inf
+    noise_power = squared_bend(path) + miss**2 / len(stencils)
+    signal_power = squared_bend(offset)
+    return np.sqrt(noise_power / signal_power) if signal_power > 0 else np.inf
 
 
 def second_differences(time: np.ndarray) -> np.ndarray:
@@ -216,7 +216,7 @@ def _bands(stencils, frames):
     return bands
 
 
-def _solved(blocks, bands, right):
+def _solve(blocks, bands, right):
     """Solve the system of 3 x 3 blocks plus the penalty on each coordinate."""
     frames = len(blocks)
     lower = np.zeros((7, 3 * frames))
@@ -247,10 +247,10 @@ def depth_around(
     depth = np.full(tracks.visible.shape, np.nan)
     for frame in range(tracks.visible.shape[1]):
         here = np.flatnonzero(still.visible[:, frame] & (rest.depth[:, frame] > near))
-        wanted = np.flatnonzero(tracks.visible[:, frame])
-        if len(here) < AROUND or not len(wanted):
+        rows = np.flatnonzero(tracks.visible[:, frame])
+        if len(here) < AROUND or not len(rows):
             continue
         tree = cKDTree(still.pixel[here, frame])
-        _, nearest = tree.query(tracks.pixel[wanted, frame], AROUND)
-        depth[wanted, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
+        _, nearest = tree.query(tracks.pixel[rows, frame], AROUND)
+        depth[rows, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
     return depth

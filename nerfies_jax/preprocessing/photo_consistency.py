@@ -41,30 +41,30 @@ def log_odds(views: Views, still: PointCloud) -> np.ndarray:
     frames = len(views.row)
     if not len(still.position):
         return np.zeros(views.gray.shape, np.float32)
-    color, spread = _leveled(views)
+    color, spread = _normalize(views)
     depth = [
         _depth(views, frame, still.position.astype(float)) for frame in range(frames)
     ]
-    clipped = np.zeros(views.gray.shape, np.float32)
+    all_odds = np.zeros(views.gray.shape, np.float32)
     for frame in range(frames):
         unlike = _unlike(views, color, depth, frame)
         slope = _slope(color[frame])
         even = EVEN * spread + EVEN_SLOPE * slope
         with np.errstate(invalid="ignore"):
             odds = STEEPNESS * np.log((unlike + 1) / (even + 1))
-        clipped[frame] = np.clip(np.nan_to_num(odds, nan=0.0), -MOST, MOST)
-    return clipped
+        all_odds[frame] = np.clip(np.nan_to_num(odds, nan=0.0), -MOST, MOST)
+    return all_odds
 
 
-def _leveled(views):
+def _normalize(views):
     """Return blurred images normalized to one mean and spread, and that spread."""
     image = views.image.astype(np.float32)
     mean, spread = image.mean((1, 2)), np.maximum(image.std((1, 2)), 1e-3)
     typical = np.median(spread, axis=0)
     gain = (typical / spread)[:, None, None]
     alike = (image - mean[:, None, None]) * gain + np.median(mean, axis=0)
-    blurred = [cv2.GaussianBlur(one, (0, 0), BLUR_PX) for one in alike]
-    return np.stack(blurred), float(typical.mean())
+    blurred_images = [cv2.GaussianBlur(frame, (0, 0), BLUR_PX) for frame in alike]
+    return np.stack(blurred_images), float(typical.mean())
 
 
 def _slope(color):
@@ -126,8 +126,8 @@ def _unlike(views, color, depth, frame):
     order = np.sort(differences, axis=0)  # NaN is last
     count = np.isfinite(order).sum(0)
     place = np.floor(QUANTILE * np.maximum(count - 1, 0)).astype(int)
-    chosen = np.take_along_axis(order, place[None], axis=0)[0]
-    return np.where(count >= LEAST_FRAMES, chosen, np.nan)
+    quantile = np.take_along_axis(order, place[None], axis=0)[0]
+    return np.where(count >= LEAST_FRAMES, quantile, np.nan)
 
 
 def _places(views, frame, other, pixel, depth):

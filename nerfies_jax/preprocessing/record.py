@@ -89,10 +89,10 @@ def gather(
       The results, with the names of skipped parts.
     """
     with contextlib.closing(Watch(tell, capture.preprocessing * ENOUGH_WORK)) as watch:
-        return _gathered(capture, use_depths, rough_cameras, watch)
+        return _gather(capture, use_depths, rough_cameras, watch)
 
 
-def _gathered(capture, use_depths, rough_cameras, watch):
+def _gather(capture, use_depths, rough_cameras, watch):
     watch.begin("flow")
     capture = pinholes.as_pinholes(capture)
     external = capture.external or ExternalResults(capture.size)
@@ -111,7 +111,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     if span is not None and not rough_cameras:
         least = short_tracks.lengths(views, span, carried(views, flow))
     if is_computed and least == short_tracks.SHORT:
-        flow = _recovered(views, images, flow, watch)
+        flow = _recover_flow(views, images, flow, watch)
     watch.begin("tracks")
     every = 1e-6 * A_TRACK_FRAME * tracking.work(views)
     few = not watch.has_room(FOR_TRACKS, "half of the tracks", every)
@@ -129,13 +129,13 @@ def _gathered(capture, use_depths, rough_cameras, watch):
     path_tracks = tracks.take(slice(0))
     if not unusable:
         own = tracks.take(slice(first, None))
-        path_tracks = _moved(own, score[first:], moves, least.path, views.size)
+        path_tracks = _select_moving(own, score[first:], moves, least.path, views.size)
     if not first:
         watch.spend(1e-6 * A_PATCH_FRAME * path_tracks.visible.size)
         path_tracks = patch_alignment.align(path_tracks, images, views.size)
         path_tracks = path_tracks.take(_are_long(path_tracks, least.path))
-    still = np.flatnonzero(score < paths.AT_REST)
-    static = tracks.take(still), rest.take(still)
+    static_rows = np.flatnonzero(score < paths.AT_REST)
+    static = tracks.take(static_rows), rest.take(static_rows)
     depths = path_depths.known(capture, external, views, static, use_depths)
     moved_paths = path_depths.fitted(
         capture, views, path_tracks, static, depths, watch, least.known
@@ -147,7 +147,7 @@ def _gathered(capture, use_depths, rough_cameras, watch):
         dense = still_points.dense(views, flow, moves.mask)
     return Evidence(
         row=views.row,
-        flow=_rounded(flow),
+        flow=_round_flow(flow),
         moving=moves.mask,
         tracks=tracks,
         score=score,
@@ -181,7 +181,7 @@ def _flow(views, images, span, watch):
     return dense_flow.between_neighbors(views, images, span, room_for)
 
 
-def _recovered(views, images, flow, watch):
+def _recover_flow(views, images, flow, watch):
     """Search for the flow of lost regions, within the budget."""
     frames = lost_regions.pairs(views, flow)
     each = lost_regions.SEARCHES * _search_work(views, images)
@@ -189,7 +189,7 @@ def _recovered(views, images, flow, watch):
     return lost_regions.recovered(views, images, flow, frames[:room])
 
 
-def _rounded(flow):
+def _round_flow(flow):
     """Round flow to half precision, in which it is cached, for identical results."""
     forward, backward = (
         side.astype(np.float16).astype(np.float32)
@@ -246,9 +246,9 @@ def _unusable(views, flow):
         return f"{frames} frames are too few for tracking"
     if np.ptp(views.time) == 0:
         return "all frames have the same time"
-    textured = views.textured.mean()
-    if textured < LEAST_TEXTURED:
-        return f"only {textured:.1%} of the pixels have texture"
+    textured_share = views.textured.mean()
+    if textured_share < LEAST_TEXTURED:
+        return f"only {textured_share:.1%} of the pixels have texture"
     share = carried(views, flow)
     if share < LEAST_CARRIED:
         return (
@@ -269,45 +269,45 @@ def carried(views: Views, flow: NeighborFlow) -> float:
     Returns:
       The share.
     """
-    shown = views.textured[:-1]
-    return float((flow.forward_seen[:-1] & shown).sum() / max(shown.sum(), 1))
+    texture = views.textured[:-1]
+    return float((flow.forward_seen[:-1] & texture).sum() / max(texture.sum(), 1))
 
 
-def _moved(tracks, score, moves, shortest, size):
+def _select_moving(tracks, score, moves, shortest, size):
     """Return the tracks of moving points, at most `MOST_PATHS`.
 
     Those that begin on the mask are used where the others are few, because they are
     less accurate.
     """
     tracks = tracks.take(_are_long(tracks, shortest) & (score > MOVES))
-    more = moves.mask_tracks.take(
+    mask_tracks = moves.mask_tracks.take(
         _are_long(moves.mask_tracks, shortest) & (moves.mask_score > MOVES)
     )
-    more = more.take(_are_sparse(more, tracks, size))
-    both = tracking.joined([tracks, more])
-    if len(both.start) <= MOST_PATHS:
-        return both
+    mask_tracks = mask_tracks.take(_are_sparse(mask_tracks, tracks, size))
+    all_tracks = tracking.joined([tracks, mask_tracks])
+    if len(all_tracks.start) <= MOST_PATHS:
+        return all_tracks
     # Long tracks are preferred, and those in frames with few.
-    chance = (both.visible / np.maximum(both.visible.sum(0), 1)).sum(1)
+    chance = (all_tracks.visible / np.maximum(all_tracks.visible.sum(0), 1)).sum(1)
     rng = np.random.default_rng(0)
-    which = rng.choice(len(chance), MOST_PATHS, replace=False, p=chance / chance.sum())
-    return both.take(np.sort(which))
+    rows = rng.choice(len(chance), MOST_PATHS, replace=False, p=chance / chance.sum())
+    return all_tracks.take(np.sort(rows))
 
 
-def _are_sparse(more, tracks, size):
-    """Find those of `more` that have few `tracks` around them in most frames."""
-    frames = more.visible.shape[1]
+def _are_sparse(mask_tracks, tracks, size):
+    """Find those of `mask_tracks` that have few `tracks` around them in most frames."""
+    frames = mask_tracks.visible.shape[1]
     rows = math.ceil(CELLS * size[1] / size[0])
     count = np.zeros((frames, rows, CELLS), int)
 
-    def cells(one):
-        place = one.pixel * (CELLS / size[0])
+    def cells(records):
+        place = records.pixel * (CELLS / size[0])
         row, column = tracking.pixel_of(place, (rows, CELLS))
         return np.broadcast_to(np.arange(frames), row.shape), row, column
 
     np.add.at(count, tuple(part[tracks.visible] for part in cells(tracks)), 1)
-    few = (count[cells(more)] < ENOUGH_IN_CELL) & more.visible
-    return few.sum(1) > 0.5 * more.visible.sum(1)
+    few = (count[cells(mask_tracks)] < ENOUGH_IN_CELL) & mask_tracks.visible
+    return few.sum(1) > 0.5 * mask_tracks.visible.sum(1)
 
 
 def _are_long(tracks, shortest):
@@ -344,7 +344,7 @@ def cached(
         with cache_files.making(path):
             evidence = cache_files.read(path, load)
             if evidence is None:
-                evidence = _made(path, capture, use_depths, tell)
+                evidence = _make(path, capture, use_depths, tell)
     cache_files.mark_used(path)
     if path not in _told_of:
         notes = [left_out_note(evidence), _depth_note(evidence)]
@@ -354,7 +354,7 @@ def cached(
     return evidence
 
 
-def _made(path, capture, use_depths, tell):
+def _make(path, capture, use_depths, tell):
     """Preprocess a capture and write the results to a file of the cache."""
     limit = cache.limit_bytes()
     evidence = gather(capture, use_depths, tell)

@@ -89,17 +89,19 @@ def refined(
     Returns:
       The paths.
     """
-    position, known = paths.position.copy(), paths.known.copy()
+    position, is_known = paths.position.copy(), paths.known.copy()
     is_rigid = paths.is_rigid.copy()
     every = -(-len(views.time) // MOST_FRAMES)
-    some_views, some_tracks, few = _some_frames(views, tracks, paths, every)
-    left = few.known.sum(1) >= LEAST_KNOWN
+    some_views, some_tracks, some_paths = _some_frames(views, tracks, paths, every)
+    left = some_paths.known.sum(1) >= LEAST_KNOWN
     if left.sum() < FEWEST:
         return paths
     rows = np.flatnonzero(left)
     label = np.full(len(left), -1)
-    label[rows] = rigid_groups.labels(few.position[rows], few.known[rows], GROUPS)
-    tracked = rows
+    label[rows] = rigid_groups.labels(
+        some_paths.position[rows], some_paths.known[rows], GROUPS
+    )
+    candidates = rows
     for group in np.argsort(-np.bincount(label[rows], minlength=GROUPS), kind="stable"):
         own = np.flatnonzero((label == group) & left)
         if len(own) < FEWEST:
@@ -107,31 +109,31 @@ def refined(
         deviation = np.median(paths.depth_deviation[own])
         if deviation < DOUBTFULLY_TOLD:
             continue
-        if not has_room(_work(own, few)):
+        if not has_room(_work(own, some_paths)):
             break
         rows = np.flatnonzero(left)
         within = TRACK_PX if deviation >= BADLY_TOLD else PRECISE_PX
-        grown = _grown(some_views, some_tracks, few, own, rows, within, has_room)
-        if grown is None:
+        growth = _grow(some_views, some_tracks, some_paths, own, rows, within, has_room)
+        if growth is None:
             continue
-        own, body, error_px = grown
-        if error_px > PRECISE_PX and _is_part(few, tracked, own):
+        own, body, error_px = growth
+        if error_px > PRECISE_PX and _is_part(some_paths, candidates, own):
             continue
         if every > 1:
             body = _in_all_frames(views, tracks, paths, own, body, every)
-        body, known[own] = _at_paths_scale(views, paths, own, body)
+        body, is_known[own] = _at_paths_scale(views, paths, own, body)
         factor = _likely_factor(views, paths, own, body, every, LEAST_NATS)
         position[own] = bundle.scaled(views, body, factor).world()
         is_rigid[own] = error_px <= PRECISE_PX
         left[own] = False
     rows = np.flatnonzero(left)
-    for own in _doubtful_groups(few, rows):
-        if has_room(_work(own, few)):
-            factor = _factor_of_group(some_views, some_tracks, few, own)
+    for own in _doubtful_groups(some_paths, rows):
+        if has_room(_work(own, some_paths)):
+            factor = _factor_of_group(some_views, some_tracks, some_paths, own)
             offset = position[own] - views.position
             position[own] = views.position + factor * offset
     depth = views.depth_of(position)
-    return Paths(position, known, depth, paths.depth_deviation, is_rigid)
+    return Paths(position, is_known, depth, paths.depth_deviation, is_rigid)
 
 
 def _is_part(paths, rows, own):
@@ -178,9 +180,9 @@ def refined_short(
     Returns:
       The paths.
     """
-    position, known = paths.position.copy(), paths.known.copy()
+    position, is_known = paths.position.copy(), paths.known.copy()
     deviation = paths.depth_deviation.copy()
-    known[known.sum(1) < LEAST_KNOWN] = False
+    is_known[is_known.sum(1) < LEAST_KNOWN] = False
     left = tracks.visible.sum(1) >= least_known
     fewest = max(FEWEST, LEAST_OF_SHORT * left.sum())
     for number in range(MOST_BODIES):
@@ -190,10 +192,10 @@ def refined_short(
         ):
             break
         flat = _at_one_depth(views, tracks, paths)
-        found = _body(views, tracks, flat, rows, MOST_OF_SHORT)
-        if found is None:
+        rigid_fit = _body(views, tracks, flat, rows, MOST_OF_SHORT)
+        if rigid_fit is None:
             break
-        own, body = found
+        own, body = rigid_fit
         there = flat.known[own].sum(0) >= FEWEST_SEEN
         body, miss = _on(views, tracks, flat, body, rows, there, least_known)
         fits = miss < ROUGHLY_PX
@@ -201,25 +203,25 @@ def refined_short(
             break
         own, body = rows[fits], body._replace(point=body.point[fits])
         visible = tracks.visible[own] & there
-        shown = np.flatnonzero(visible.sum(0) >= FEWEST_SEEN)
-        center = body.world()[:, shown].mean(0)
+        frames = np.flatnonzero(visible.sum(0) >= FEWEST_SEEN)
+        center = body.world()[:, frames].mean(0)
         scale = body_scale.from_smoothness(
-            views.time[shown], views.position[shown], center
+            views.time[frames], views.position[frames], center
         )
         is_determined = scale.deviation < MOST_DEVIATION
         if number and not is_determined:
             break
         if is_determined:
             position[own] = bundle.scaled(views, body, scale.factor).world()
-            known[own] = visible
+            is_known[own] = visible
         else:
-            position[own], known[own] = _at_paths_scale(views, paths, own, body)
+            position[own], is_known[own] = _at_paths_scale(views, paths, own, body)
         deviation[own] = scale.deviation
         left[own] = False
-        known[left] = False
+        is_known[left] = False
     depth = views.depth_of(position)
-    known &= np.nan_to_num(depth, nan=-1.0) > 0
-    return Paths(position, known, depth, deviation, paths.is_rigid)
+    is_known &= np.nan_to_num(depth, nan=-1.0) > 0
+    return Paths(position, is_known, depth, deviation, paths.is_rigid)
 
 
 def _at_one_depth(views, tracks, paths):
@@ -246,13 +248,13 @@ def _some_frames(views, tracks, paths, every):
     """Select views, tracks and paths of every `every`-th frame."""
     if every == 1:
         return views, tracks, paths
-    kept = slice(None, None, every)
+    step = slice(None, None, every)
     rarer = {
-        name: getattr(paths, name)[:, kept] for name in ("position", "known", "depth")
+        name: getattr(paths, name)[:, step] for name in ("position", "known", "depth")
     }
     return (
-        Views(*(part[kept] for part in views)),
-        Tracks(tracks.start // every, tracks.pixel[:, kept], tracks.visible[:, kept]),
+        Views(*(part[step] for part in views)),
+        Tracks(tracks.start // every, tracks.pixel[:, step], tracks.visible[:, step]),
         paths._replace(**rarer),
     )
 
@@ -260,17 +262,17 @@ def _some_frames(views, tracks, paths, every):
 def _in_all_frames(views, tracks, paths, own, body, every):
     """Extend a body of every `every`-th frame to all frames."""
     frames = np.arange(len(views.time))
-    kept = frames[::every]
-    within = np.minimum(frames, kept[-1])  # it stays where it was last
-    turn = Slerp(kept, Rotation.from_matrix(body.rotation))(within).as_matrix()
-    shift = np.stack([np.interp(within, kept, axis) for axis in body.shift.T], -1)
+    keyframes = frames[::every]
+    within = np.minimum(frames, keyframes[-1])  # it stays where it was last
+    turn = Slerp(keyframes, Rotation.from_matrix(body.rotation))(within).as_matrix()
+    shift = np.stack([np.interp(within, keyframes, axis) for axis in body.shift.T], -1)
     some = np.isin(own, _fewer(paths, own))
     sight = bundle.sight(views, tracks.take(own[some]), paths.known[own[some]])
-    posed = bundle.posed(views, sight, Body(body.point[some], turn, shift))
-    return posed._replace(point=body.point)
+    posed_body = bundle.posed(views, sight, Body(body.point[some], turn, shift))
+    return posed_body._replace(point=body.point)
 
 
-def _grown(views, tracks, paths, own, rows, within, has_room):
+def _grow(views, tracks, paths, own, rows, within, has_room):
     """Return the paths on the rigid object of `own`, it, and its error, or None.
 
     The object is extended to more frames by tracks that are visible there. Its median
@@ -282,10 +284,10 @@ def _grown(views, tracks, paths, own, rows, within, has_room):
         before, selection = selection, _fewer(paths, own)
         if np.array_equal(before, selection):
             break  # another round would repeat the last one
-        found = _body(views, tracks, paths, own, MOST, bend_px, WITHIN_PX)
-        if found is None:
+        rigid_fit = _body(views, tracks, paths, own, MOST, bend_px, WITHIN_PX)
+        if rigid_fit is None:
             break
-        own, body = found
+        own, body = rigid_fit
         there = paths.known[own].sum(0) >= FEWEST_SEEN
         miss = _on(views, tracks, paths, body, rows, there)[1]
         fits = miss < WITHIN_PX
@@ -331,10 +333,10 @@ def _fewer(paths, own, most=MOST):
 
 def _first(paths, own):
     """Initialize a body from the paths."""
-    position, known = paths.position[own], paths.known[own]
+    position, is_known = paths.position[own], paths.known[own]
     canonical = position.shape[1] // 2
-    motion = rigid_groups.motion(position, known, np.zeros(len(own), int), canonical)
-    point, (middle,) = rigid_groups.centers(position, known, motion)
+    motion = rigid_groups.motion(position, is_known, np.zeros(len(own), int), canonical)
+    point, (middle,) = rigid_groups.centers(position, is_known, motion)
     shift = motion.shift[0] + motion.rotation[0] @ middle
     return Body(point - middle, motion.rotation[0], shift)
 
@@ -345,14 +347,14 @@ def _on(views, tracks, paths, body, rows, there, least_known=LEAST_KNOWN):
     Only the frames `there` are used. The error is infinite if a path is known in too
     few of them.
     """
-    known = paths.known[rows] & there
+    is_known = paths.known[rows] & there
     local = paths.position[rows] - body.shift
     local = np.einsum("fji,nfj->nfi", body.rotation, local)
-    local = np.where(known[..., None], local, np.nan)
-    enough = known.sum(1) >= least_known
+    local = np.where(is_known[..., None], local, np.nan)
+    enough = is_known.sum(1) >= least_known
     point = np.zeros((len(rows), 3))
     point[enough] = np.nanmedian(local[enough], axis=1)
-    sight = bundle.sight(views, tracks.take(rows), known & enough[:, None])
+    sight = bundle.sight(views, tracks.take(rows), is_known & enough[:, None])
     whole = bundle.placed(views, sight, body._replace(point=point))
     miss = bundle.misses(views, sight, whole)
     return whole, bundle.typical_misses(sight, miss, len(rows))
@@ -361,29 +363,29 @@ def _on(views, tracks, paths, body, rows, there, least_known=LEAST_KNOWN):
 def _at_paths_scale(views, paths, own, body):
     """Return a body scaled to the median depth of its paths, and where it is known."""
     enough = paths.known[own].sum(0) >= FEWEST_SEEN
-    known = paths.known[own] & enough
+    is_known = paths.known[own] & enough
     depth = views.depth_of(body.world())
-    known &= depth > 0
-    factor = np.median(paths.depth[own][known] / depth[known])
-    return bundle.scaled(views, body, factor), known
+    is_known &= depth > 0
+    factor = np.median(paths.depth[own][is_known] / depth[is_known])
+    return bundle.scaled(views, body, factor), is_known
 
 
 def _likely_factor(views, paths, own, body, every=1, least_nats=0.0):
     """Return the most likely factor of a body at the scale of its paths."""
-    shown = np.flatnonzero(paths.known[own].sum(0) >= FEWEST_SEEN)[::every]
-    center = body.world()[:, shown].mean(0)
+    frames = np.flatnonzero(paths.known[own].sum(0) >= FEWEST_SEEN)[::every]
+    center = body.world()[:, frames].mean(0)
     deviation = float(np.median(paths.depth_deviation[own]))
     return body_scale.most_likely(
-        views.time[shown], views.position[shown], center, deviation, least_nats
+        views.time[frames], views.position[frames], center, deviation, least_nats
     )
 
 
 def _factor_of_group(views, tracks, paths, own):
     """Return the factor of an object that is only roughly rigid, 1 if it is not."""
-    found = _body(views, tracks, paths, own)
-    if found is None:
+    rigid_fit = _body(views, tracks, paths, own)
+    if rigid_fit is None:
         return 1.0
-    part, body = found
+    part, body = rigid_fit
     there = paths.known[part].sum(0) >= FEWEST_SEEN
     if not there.any():
         return 1.0

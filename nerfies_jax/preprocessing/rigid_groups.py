@@ -50,9 +50,9 @@ def labels(position: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
     count = min(count, max(1, paths // 2))
     if count == 1:
         return np.zeros(paths, int)
-    first, second, both = _pairs(position, known)
+    first, second, is_common = _pairs(position, known)
     distance = np.linalg.norm(position[first] - position[second], axis=-1)
-    distance = np.where(both, distance, np.nan)
+    distance = np.where(is_common, distance, np.nan)
     change, size = np.nanstd(distance, axis=1), np.nanmedian(distance, axis=1)
     typical = max(np.median(change), 1e-6 * np.median(size), 1e-30)
     near = np.exp(-size / max(2 * np.median(size), 1e-30))
@@ -80,24 +80,22 @@ def _leading(matrix, count):
         return scipy.linalg.eigh(matrix.toarray(), subset_by_index=last)[1]
 
 
-def _pairs(position, known):
+def _pairs(position, is_known):
     edges = set()
-    for frame in range(0, known.shape[1], EVERY_FRAMES):
-        here = np.flatnonzero(known[:, frame])
+    for frame in range(0, is_known.shape[1], EVERY_FRAMES):
+        here = np.flatnonzero(is_known[:, frame])
         if len(here) < 3:
             continue
-        wanted = min(NEIGHBORS, len(here) - 1)
-        _, near = cKDTree(position[here, frame]).query(
-            position[here, frame], wanted + 1
-        )
-        mine = np.repeat(here, wanted)
+        count = min(NEIGHBORS, len(here) - 1)
+        _, near = cKDTree(position[here, frame]).query(position[here, frame], count + 1)
+        mine = np.repeat(here, count)
         theirs = here[near[:, 1:]].ravel()
         low, high = np.minimum(mine, theirs), np.maximum(mine, theirs)
         edges.update(zip(low.tolist(), high.tolist(), strict=True))
     first, second = np.array(sorted(edges), int).reshape(-1, 2).T
-    both = known[first] & known[second]
-    kept = both.sum(1) >= min(SHARED_FRAMES, known.shape[1])
-    return first[kept], second[kept], both[kept]
+    is_common = is_known[first] & is_known[second]
+    overlaps = is_common.sum(1) >= min(SHARED_FRAMES, is_known.shape[1])
+    return first[overlaps], second[overlaps], is_common[overlaps]
 
 
 def motion(
@@ -126,7 +124,7 @@ def motion(
         start = int(np.argmax(known[member].sum(0)))
         for sign in (1, -1):
             for frame in range(start + sign, frames if sign > 0 else -1, sign):
-                source, (turn, move) = _carried(
+                source, (turn, move) = _estimate_step(
                     position, known, member, frame, sign, start
                 )
                 rotation[group, frame] = turn @ rotation[group, source]
@@ -137,22 +135,22 @@ def motion(
     return RigidMotion(label, rotation, shift)
 
 
-def _carried(position, known, member, frame, sign, start):
+def _estimate_step(position, is_known, member, frame, sign, start):
     """Return the frame that the motion to `frame` is estimated from, and the motion."""
     before = frame - sign
-    shared = member[known[member, before] & known[member, frame]]
+    rows = member[is_known[member, before] & is_known[member, frame]]
     for hop in HOPS:
         source = frame - sign * hop
         if (source - start) * sign < 0:
             continue
-        common = member[known[member, source] & known[member, frame]]
-        if len(common) >= SHARED_POINTS and len(common) > SHARED_SHARE * len(shared):
+        common = member[is_known[member, source] & is_known[member, frame]]
+        if len(common) >= SHARED_POINTS and len(common) > SHARED_SHARE * len(rows):
             return source, procrustes(position[common, source], position[common, frame])
-    if len(shared) >= FEWEST:
-        return before, procrustes(position[shared, before], position[shared, frame])
+    if len(rows) >= FEWEST:
+        return before, procrustes(position[rows, before], position[rows, frame])
     move = np.zeros(3)
-    if len(shared):
-        move = np.median(position[shared, frame] - position[shared, before], axis=0)
+    if len(rows):
+        move = np.median(position[rows, frame] - position[rows, before], axis=0)
     return before, (np.eye(3), move)
 
 
@@ -202,8 +200,8 @@ def centers(
     for row, group in enumerate(bodies.label):
         at = np.flatnonzero(known[row])
         back = position[row, at] - bodies.shift[group, at]
-        turned = np.einsum("tji,tj->ti", bodies.rotation[group, at], back)
-        canonical[row] = np.median(turned, axis=0)
+        local = np.einsum("tji,tj->ti", bodies.rotation[group, at], back)
+        canonical[row] = np.median(local, axis=0)
     middle = np.zeros((len(bodies.rotation), 3))
     for group in np.unique(bodies.label):
         middle[group] = np.median(canonical[bodies.label == group], axis=0)
@@ -224,8 +222,8 @@ def miss(position: np.ndarray, known: np.ndarray, count: int) -> float:
     label = labels(position, known, count)
     bodies = motion(position, known, label, position.shape[1] // 2)
     canonical, _ = centers(position, known, bodies)
-    moved = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
-    away = np.linalg.norm(moved + bodies.shift[label] - position, axis=-1)
+    offset = np.einsum("ptij,pj->pti", bodies.rotation[label], canonical)
+    away = np.linalg.norm(offset + bodies.shift[label] - position, axis=-1)
     return float(np.median(away[known]))
 
 
@@ -267,8 +265,8 @@ def enough(
     Returns:
       One of `counts`.
     """
-    one, last = (miss(position, known, count) for count in (1, counts[-1]))
-    limit = one - share * max(one - last, 0.0)
+    first, last = (miss(position, known, count) for count in (1, counts[-1]))
+    limit = first - share * max(first - last, 0.0)
     return next(
         n for n in counts if n == counts[-1] or miss(position, known, n) <= limit
     )

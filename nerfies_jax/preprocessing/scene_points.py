@@ -35,7 +35,7 @@ def _coverage(views: Views, points: np.ndarray) -> float:
     """Compute the share of image cells with observed pixels that contain a point."""
     across, down = CELLS
     width, height = views.size
-    held = shown = 0
+    hits = total = 0
     for index in range(len(views.row)):
         pixel, depth = view_set.project(views, index, points)
         inside = view_set.in_image(views, pixel, depth, 0)
@@ -46,12 +46,12 @@ def _coverage(views: Views, points: np.ndarray) -> float:
         lines = np.array_split(views.valid[index], down, axis=0)
         scene = np.array(
             [
-                [cell.mean() > 0.5 for cell in np.array_split(one, across, axis=1)]
-                for one in lines
+                [cell.mean() > 0.5 for cell in np.array_split(row, across, axis=1)]
+                for row in lines
             ]
         )
-        held, shown = held + (has & scene).sum(), shown + scene.sum()
-    return held / shown if shown else 0.0
+        hits, total = hits + (has & scene).sum(), total + scene.sum()
+    return hits / total if total else 0.0
 
 
 def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> float:
@@ -59,7 +59,7 @@ def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> fl
     across, down = CELLS
     width, height = views.size
     size = height // down, width // across
-    held = shown = 0
+    hits = total = 0
     for index in _sampled_frames(views):
         moving = evidence.moving[index]
         if moving.mean() < LEAST_MOVING:
@@ -73,9 +73,9 @@ def _moving_coverage(views: Views, evidence: Evidence, points: np.ndarray) -> fl
         for i, j in set(zip(line // size[0], column // size[1], strict=True)):
             box = np.s_[i * size[0] : (i + 1) * size[0]]
             beside = np.s_[j * size[1] : (j + 1) * size[1]]
-            held += (near[box, beside] & moving[box, beside]).any()
-            shown += 1
-    return held / shown if shown else np.nan
+            hits += (near[box, beside] & moving[box, beside]).any()
+            total += 1
+    return hits / total if total else np.nan
 
 
 def _sampled_frames(views):
@@ -103,22 +103,23 @@ def start(
     if count == 0:
         measurement = "the capture has no points: Gaussians are initialized at random"
         return Finding(START, measurement, threshold, False, CERTAIN, {"points": 0.0})
-    covered = _coverage(views, points)
+    coverage = _coverage(views, points)
     inside = _moving_coverage(views, evidence, points)
     enough = judge(count, MIN_POINTS, np.sqrt(count))
-    spread = judge(covered, COVERED, 0.02)
+    spread = judge(coverage, COVERED, 0.02)
     # Both conditions must hold. The confidence is that of the less certain one.
-    wanted, confidence = min(
-        (enough, spread), key=lambda one: (one[0] is not False, one[1] == CERTAIN)
+    decision, confidence = min(
+        (enough, spread),
+        key=lambda judgment: (judgment[0] is not False, judgment[1] == CERTAIN),
     )
     measurement = (
-        f"{count} points in {covered:.0%} of the {CELLS[0]}x{CELLS[1]} cells of images"
+        f"{count} points in {coverage:.0%} of the {CELLS[0]}x{CELLS[1]} cells of images"
     )
-    numbers = {"points": float(count), "covered_share": covered}
+    numbers = {"points": float(count), "covered_share": coverage}
     if np.isfinite(inside):
         numbers["moving_covered_share"] = float(inside)
         measurement += f", and in {inside:.0%} of the cells with moving objects"
-    return Finding(START, measurement, threshold, wanted, confidence, numbers)
+    return Finding(START, measurement, threshold, decision, confidence, numbers)
 
 
 def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
@@ -155,10 +156,10 @@ def background(views: Views, evidence: Evidence, points: np.ndarray) -> Finding:
     moves, confidence = judge(
         1 - share, 1 - STILL_SHARE, np.sqrt(share * (1 - share) / count)
     )
-    wanted = None if moves is None else not moves
+    decision = None if moves is None else not moves
     measurement = f"{share:.1%} of {count} points agree with the tracks"
     numbers = {"still_share": share}
-    return Finding(BACKGROUND, measurement, threshold, wanted, confidence, numbers)
+    return Finding(BACKGROUND, measurement, threshold, decision, confidence, numbers)
 
 
 def _stays(views, evidence, frame, points):
@@ -169,27 +170,27 @@ def _stays(views, evidence, frame, points):
     shows no depth, and only tests that the surface at the point stays with the point.
     """
     pixel, depth = view_set.project(views, frame, points)
-    which = np.flatnonzero(view_set.in_image(views, pixel, depth))
+    rows = np.flatnonzero(view_set.in_image(views, pixel, depth))
     span = slice(max(0, frame - REACH), frame + REACH + 1)
     near, at = still_points.view_slice(views, span), frame - span.start
-    starts = np.concatenate([np.full((len(which), 1), at), pixel[which]], axis=-1)
+    starts = np.concatenate([np.full((len(rows), 1), at), pixel[rows]], axis=-1)
     flow = NeighborFlow(*(part[span] for part in evidence.flow))
     tracks = tracking.chain(flow, starts)
     enough = tracks.visible.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
-    which, tracks = which[enough], tracks.take(enough)
+    rows, tracks = rows[enough], tracks.take(enough)
     rest = rest_points.fit(near, tracks)
-    # One where the point lies on what is shown.
-    share = depth[which] / rest.depth[:, at]
+    # One if the point lies on the visible surface.
+    share = depth[rows] / rest.depth[:, at]
     deep = still_points.depth_deviation(near, tracks, rest) < DEPTH_KNOWN
-    checked = ~deep | (share < 1 + DEPTH_AGREES)
+    can_check = ~deep | (share < 1 + DEPTH_AGREES)
     through = deep & (share < 1 - DEPTH_AGREES)
     misses = np.full(tracks.visible.shape, np.nan)
     for other in range(len(near.row)):
-        there, _ = view_set.project(near, other, points[which])
+        there, _ = view_set.project(near, other, points[rows])
         miss = np.linalg.norm(there - tracks.pixel[:, other], axis=-1)
         misses[:, other] = np.where(tracks.visible[:, other], miss, np.nan)
     misses[:, at] = np.nan
     middle = np.nanmedian(misses, axis=1)
     bound = AGREES_PX * view_set.times_smaller(views)
     bound = max(bound, AGREES_DEVIATIONS * rest_noise(evidence))
-    return which[checked], (middle < bound)[checked] & ~through[checked]
+    return rows[can_check], (middle < bound)[can_check] & ~through[can_check]

@@ -105,12 +105,12 @@ def _by_tracks(views, flow, tracks, rest, lengths, watch):
         all_rest = tracking.joined([rest, points])
         score = moving.track_scores(all_tracks, all_rest, len(tracks.start))
         mask = _mask(views, colors, _votes(colors, all_tracks, score))
-    count, added = len(tracks.start), len(mask_tracks.start)
+    count, mask_count = len(tracks.start), len(mask_tracks.start)
     return Moving(
         mask,
         moving.settled(tracks, score[:count], mask),
         mask_tracks,
-        moving.settled(mask_tracks, score[count:][:added], mask),
+        moving.settled(mask_tracks, score[count:][:mask_count], mask),
     )
 
 
@@ -118,7 +118,7 @@ def _tracks_on(views, flow, mask, lengths, watch):
     """Chain tracks from the pixels of a mask, but not from its rim."""
     every = 1 if lengths == SHORT else tracking.EVERY_FRAMES
     side = 2 * round(RIM_PX * moving.image_scale(mask.shape[2])) + 1
-    inside = [cv2.erode(np.uint8(one), np.ones((side, side))) for one in mask]
+    inside = [cv2.erode(np.uint8(frame), np.ones((side, side))) for frame in mask]
     starts = tracking.grid_on(np.stack(inside) > 0, every)
     work = 1e-6 * A_TRACK_FRAME * len(starts) * len(views.row)
     if not watch.has_room(FOR_MORE, "more tracks of moving objects", work):
@@ -135,7 +135,7 @@ def _colors(views, flow, tracks, score, watch):
     work = 1e-6 * A_POINT_FRAME * still_points.work(views)
     work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
     if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
-        may_move = _enlarged(moving.may_move(share), views.size)
+        may_move = _enlarge(moving.may_move(share), views.size)
         still = still_points.dense(views, flow, may_move)
         odds = photo_consistency.log_odds(colors.views, still)
     return share, colors._replace(odds=odds)
@@ -148,11 +148,11 @@ def _votes(colors, tracks, score):
 
 def _mask(views, colors, share):
     masks = moving.mask(colors.views, share, colors.odds)
-    return _enlarged(masks, views.size) & views.valid
+    return _enlarge(masks, views.size) & views.valid
 
 
-def _enlarged(masks, size):
+def _enlarge(masks, size):
     if masks.shape[:0:-1] == tuple(size):
         return masks
-    enlarged = [cv2.resize(np.float32(one), size) > 0.5 for one in masks]
-    return np.stack(enlarged)
+    full_masks = [cv2.resize(np.float32(mask), size) > 0.5 for mask in masks]
+    return np.stack(full_masks)

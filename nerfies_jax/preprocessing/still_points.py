@@ -52,14 +52,14 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         span = slice(max(0, center - reach), min(frames, center + reach + 1))
         near = view_slice(views, span)
         starts = _starts(near, moving[center], center - span.start)
-        still = NeighborFlow(*(part[span] for part in flow))
-        tracks = without(tracking.chain(still, starts), moving[span])
+        near_flow = NeighborFlow(*(part[span] for part in flow))
+        tracks = without(tracking.chain(near_flow, starts), moving[span])
         enough = tracks.visible.sum(1) >= min(LEAST_FRAMES, reach + 1)
         tracks = tracks.take(enough)
         if not len(tracks.visible):
             continue
         rest = rest_points.fit(near, tracks)
-        valid = _placed(near, tracks, rest)
+        valid = _has_depth(near, tracks, rest)
         places.append(rest.position[valid])
         pixel = starts[enough][valid, 1:].astype(int)
         colors.append(views.image[center][pixel[:, 1], pixel[:, 0]])
@@ -87,8 +87,8 @@ def _starts(views, moving, frame):
         np.arange(1, width - 1, EVERY_PX), np.arange(1, height - 1, EVERY_PX)
     )
     x, y = x.ravel(), y.ravel()
-    shown = (views.valid[frame] & ~moving)[y, x]
-    pixel = np.stack([x, y], -1)[shown] + 0.5
+    is_static = (views.valid[frame] & ~moving)[y, x]
+    pixel = np.stack([x, y], -1)[is_static] + 0.5
     return np.concatenate([np.full((len(pixel), 1), frame), pixel], axis=-1)
 
 
@@ -107,10 +107,10 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
     return tracks._replace(visible=tracks.visible & ~moving[frames, row, column])
 
 
-def _placed(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
-    """Select tracks that fit their static point and determine its depth."""
-    explained = rest_points.miss(rest) < MISS_PX
-    return explained & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
+def _has_depth(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+    """Test if tracks fit their static point and determine its depth."""
+    fits = rest_points.miss(rest) < MISS_PX
+    return fits & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
 
 
 def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:

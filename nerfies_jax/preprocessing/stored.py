@@ -71,14 +71,14 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
 
 def _over_parallax(depths, views, evidence):
     """Return the ratios of stored depth to the depth of static tracks."""
-    still = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
-    tracks, rest = evidence.tracks.take(still), evidence.rest.take(still)
+    static_rows = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
+    tracks, rest = evidence.tracks.take(static_rows), evidence.rest.take(static_rows)
     sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
     tracks, rest = tracks.take(sure), rest.take(sure)
     row, column = pixel_of(tracks.pixel, depths.shape[1:])
     own = depths[np.arange(len(depths)), row, column]
-    known = tracks.visible & (own > 0) & (rest.depth > 0)
-    return own[known] / rest.depth[known]
+    is_known = tracks.visible & (own > 0) & (rest.depth > 0)
+    return own[is_known] / rest.depth[is_known]
 
 
 def masks(capture: Capture, evidence: Evidence) -> Finding:
@@ -145,9 +145,9 @@ def lens(capture: Capture) -> Finding:
     for row in np.unique(parameters, axis=0, return_index=True)[1]:
         focal = np.array([1, cameras.pixel_aspect[row]]) * cameras.focal_px[row]
         slope = ((pixel - cameras.principal_point_px[row]) / focal).astype(np.float32)
-        one = jax.tree.map(jnp.float32, camera_records.take(cameras, row))
-        bent = jax.vmap(lenses.distort, (None, 0))(one, jnp.asarray(slope))
-        shift = np.linalg.norm((np.asarray(bent) - slope) * focal, axis=-1)
+        camera = jax.tree.map(jnp.float32, camera_records.take(cameras, row))
+        distorted_xy = jax.vmap(lenses.distort, (None, 0))(camera, jnp.asarray(slope))
+        shift = np.linalg.norm((np.asarray(distorted_xy) - slope) * focal, axis=-1)
         worst = max(worst, float(shift.max()))
     bends, confidence = judge(worst, LENS_PX, 0.0)
     measurement = f"lens distortion displaces pixels by up to {worst:.2g} px"

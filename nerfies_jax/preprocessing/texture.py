@@ -43,12 +43,12 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
       The finding.
     """
     threshold = f"{SMALL} bands, as in the small presets of radiance fields"
-    frames = [one for one in _shown(views) if views.valid[one].mean() > 0.5]
+    frames = [frame for frame in _sample(views) if views.valid[frame].mean() > 0.5]
     if not frames:
         return cannot_tell(
             EFFECT, "plain background fills most of the views", threshold
         )
-    cycles = float(np.median([_finest(views.gray[one]) for one in frames]))
+    cycles = float(np.median([_finest(views.gray[frame]) for frame in frames]))
     near, far = view_set.depth_span(capture, views)
     depth = math.sqrt(near * far)
     scale = scene_metadata.metadata_of(capture, 1.0).scale
@@ -64,7 +64,7 @@ def texture(capture: Capture, views: Views, factor: int) -> Finding:
     return Finding(EFFECT, evidence, threshold, bands > SMALL, sure, numbers)
 
 
-def _shown(views):
+def _sample(views):
     return np.unique(np.linspace(0, len(views.row) - 1, SHOWN).round().astype(int))
 
 

@@ -229,8 +229,8 @@ def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Trac
             if frame == start:
                 continue
             which = rows[tracks.visible[rows, frame]]
-            first = _enlarged(tracks.pixel[which, start], times)
-            guess = _enlarged(tracks.pixel[which, frame], times)
+            first = _enlarge(tracks.pixel[which, start], times)
+            guess = _enlarge(tracks.pixel[which, frame], times)
             place, status, _ = cv2.calcOpticalFlowPyrLK(
                 images[start],
                 images[frame],
@@ -249,7 +249,7 @@ def realigned(tracks: Tracks, images: np.ndarray, size: tuple[int, int]) -> Trac
     return Tracks(tracks.start, np.where(visible[..., None], pixel, 0), visible)
 
 
-def _enlarged(pixel, times):
+def _enlarge(pixel, times):
     # In OpenCV the first pixel has its center at 0, here centers are at +0.5.
     return np.ascontiguousarray(pixel * times - 0.5, np.float32)
 

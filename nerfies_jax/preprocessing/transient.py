@@ -53,8 +53,8 @@ def transient(views: Views, evidence: Evidence) -> Finding:
     )
     if evidence.unusable:
         return cannot_tell(EFFECT, evidence.unusable, threshold)
-    gone, carried = _jumps(views, evidence.flow)
-    apart = float((carried < LEAST_CARRIED).mean())
+    losses, flow_shares = _jumps(views, evidence.flow)
+    apart = float((flow_shares < LEAST_CARRIED).mean())
     if apart > MOST_APART:
         return cannot_tell(
             EFFECT,
@@ -62,15 +62,15 @@ def transient(views: Views, evidence: Evidence) -> Finding:
             "objects that disappear",
             threshold,
         )
-    gone = gone[carried >= LEAST_CARRIED]
-    if len(gone) <= 2 * MIN_TIMES:
-        return cannot_tell(EFFECT, f"only {len(gone)} pairs of frames", threshold)
+    losses = losses[flow_shares >= LEAST_CARRIED]
+    if len(losses) <= 2 * MIN_TIMES:
+        return cannot_tell(EFFECT, f"only {len(losses)} pairs of frames", threshold)
     # The losses of the other pairs are the noise level.
-    usual = float(np.sort(gone)[: -2 * MIN_TIMES].mean())
-    worst = np.sort(_above_neighbors(gone))[::-1]
-    wanted, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
+    usual = float(np.sort(losses)[: -2 * MIN_TIMES].mean())
+    worst = np.sort(_above_neighbors(losses))[::-1]
+    decision, confidence = judge(float(worst[MIN_TIMES - 1]), GONE_SHARE, usual)
     times = int((worst > GONE_SHARE).sum())
-    if wanted is False and not _always_there(evidence):
+    if decision is False and not _always_there(evidence):
         return cannot_tell(
             EFFECT,
             "nothing appears or disappears abruptly, but moving objects are visible in "
@@ -78,7 +78,7 @@ def transient(views: Views, evidence: Evidence) -> Finding:
             threshold,
         )
     measurement = (
-        f"parts of the image appear or disappear in {times} of {len(gone)} pairs of "
+        f"parts of the image appear or disappear in {times} of {len(losses)} pairs of "
         f"frames (at most {worst[0]:.1%} of the pixels, usually {usual:.2%})"
     )
     numbers = {
@@ -86,15 +86,19 @@ def transient(views: Views, evidence: Evidence) -> Finding:
         "largest_share": float(worst[0]),
         "usual_share": usual,
     }
-    return Finding(EFFECT, measurement, threshold, wanted, confidence, numbers)
+    return Finding(EFFECT, measurement, threshold, decision, confidence, numbers)
 
 
-def _above_neighbors(gone):
+def _above_neighbors(losses):
     """Return the losses of pairs above the median of their neighbors."""
     above = []
-    for at, one in enumerate(gone):
-        beside = np.r_[gone[max(0, at - AROUND) : at], gone[at + 1 : at + 1 + AROUND]]
-        above.append(max(0.0, one - float(np.median(beside))) if len(beside) else 0.0)
+    for at, loss in enumerate(losses):
+        neighbors = np.r_[
+            losses[max(0, at - AROUND) : at], losses[at + 1 : at + 1 + AROUND]
+        ]
+        above.append(
+            max(0.0, loss - float(np.median(neighbors))) if len(neighbors) else 0.0
+        )
     return np.array(above)
 
 
@@ -107,24 +111,24 @@ def _always_there(evidence):
 def _jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     """Compute the share of pixels that only one of two neighboring frames shows."""
     part = view_set.times_smaller(views)
-    textured = views.textured[:-1] & flow.forward_seen[:-1]
-    carried = textured.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
+    has_flow = views.textured[:-1] & flow.forward_seen[:-1]
+    flow_shares = has_flow.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
     views = view_set.smaller(views, part)
-    images = [_leveled(gray) for gray in views.gray]
+    images = [_normalize_contrast(gray) for gray in views.gray]
     shares = []
-    for one in range(len(views.row) - 1):
-        there = _way(flow.forward[one], flow.forward_seen[one], part)
-        back = _way(flow.backward[one + 1], flow.backward_seen[one + 1], part)
+    for index in range(len(views.row) - 1):
+        there = _search_of(flow.forward[index], flow.forward_seen[index], part)
+        back = _search_of(flow.backward[index + 1], flow.backward_seen[index + 1], part)
         shares.append(
             min(
-                _gone(views, images, (one, one + 1), there, back.flow),
-                _gone(views, images, (one + 1, one), back, there.flow),
+                _measure_loss(views, images, (index, index + 1), there, back.flow),
+                _measure_loss(views, images, (index + 1, index), back, there.flow),
             )
         )
-    return np.array(shares), carried
+    return np.array(shares), flow_shares
 
 
-class _Way(NamedTuple):
+class _Search(NamedTuple):
     """Flow from one frame to another, and the search range for pixels without it.
 
     Only consistent flow is used, since the flow of vanished pixels is arbitrary.
@@ -135,7 +139,7 @@ class _Way(NamedTuple):
     reach: int  # px around it
 
 
-def _way(flow, valid, part):
+def _search_of(flow, valid, part):
     """Return the flow and search range in pixels of reduced images."""
     flow = dense_flow.reduced(flow, part)
     valid = cv2.resize(np.uint8(valid), flow.shape[1::-1]) > 0
@@ -144,46 +148,46 @@ def _way(flow, valid, part):
     off = np.linalg.norm(usual - shift, axis=-1)
     low, high = (share * flow.shape[1] for share in REACH_SHARES)
     reach = round(float(np.clip(2 * np.quantile(off, 0.9), low, high)))
-    return _Way(flow, shift, reach)
+    return _Search(flow, shift, reach)
 
 
-def _leveled(gray):
+def _normalize_contrast(gray):
     """Subtract the local mean of an image and normalize its contrast."""
     detail = gray - cv2.GaussianBlur(gray, (0, 0), LOCAL_PX)
     spread = np.sqrt(np.mean(detail**2))
     return detail / (5 * spread) if spread > 0 else detail
 
 
-def _gone(views, images, pair, there, back):
+def _measure_loss(views, images, pair, there, back):
     """Return the share of pixels of a frame that are not visible in another one."""
     image, target = (images[index] for index in pair)
-    lost = _lost(views, pair[0], image, target, there, back)
-    tried = np.argwhere(lost & views.textured[pair[0]])
-    if not len(tried):
+    lost_mask = _find_lost_pixels(views, pair[0], image, target, there, back)
+    patches = np.argwhere(lost_mask & views.textured[pair[0]])
+    if not len(patches):
         return 0.0
     rng = np.random.default_rng(pair[0])
-    if len(tried) > MOST_PATCHES:
-        tried = tried[rng.choice(len(tried), MOST_PATCHES, replace=False)]
+    if len(patches) > MOST_PATCHES:
+        patches = patches[rng.choice(len(patches), MOST_PATCHES, replace=False)]
     shift = there.shift.round().astype(int)
     missing = sum(
-        not _found(image, target, line, column, shift, there.reach)
-        for line, column in tried
+        not _has_match(image, target, line, column, shift, there.reach)
+        for line, column in patches
     )
-    return float(lost.mean() * missing / len(tried))
+    return float(lost_mask.mean() * missing / len(patches))
 
 
-def _lost(views, index, image, target, there, back):
+def _find_lost_pixels(views, index, image, target, there, back):
     """Find pixels [height, width] without a match that should be in the other frame."""
     width, height = views.size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     end = np.moveaxis(grid + there.flow, -1, 0).astype(np.float32)
-    led_back, color = (
-        cv2.remap(one, *end, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for one in (back, target)
+    flow_back, color = (
+        cv2.remap(array, *end, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for array in (back, target)
     )
-    gap = np.linalg.norm(there.flow + led_back, axis=-1)
+    gap = np.linalg.norm(there.flow + flow_back, axis=-1)
     open_end = gap > LOST_PX + LOST_SHARE * np.linalg.norm(there.flow, axis=-1)
-    changed = cv2.GaussianBlur(np.abs(image - color), (0, 0), 1.5) > LOST_COLOR
+    differs = cv2.GaussianBlur(np.abs(image - color), (0, 0), 1.5) > LOST_COLOR
     # Pixels may leave the image by the common shift, or by the larger shift of near
     # objects, and need a margin for the patch.
     rim = PATCH + there.reach
@@ -192,11 +196,11 @@ def _lost(views, index, image, target, there, back):
     stays = ((common >= rim) & (common <= bound)).all(-1)
     bound = np.array([width - 1, height - 1]) - PATCH
     stays &= ((grid >= PATCH) & (grid <= bound)).all(-1)
-    lost = (open_end | changed) & stays & views.valid[index]
-    return nd.binary_opening(lost, iterations=max(1, round(OPENED_SHARE * width)))
+    lost_mask = (open_end | differs) & stays & views.valid[index]
+    return nd.binary_opening(lost_mask, iterations=max(1, round(OPENED_SHARE * width)))
 
 
-def _found(image, target, line, column, shift, reach):
+def _has_match(image, target, line, column, shift, reach):
     patch = image[line - PATCH : line + PATCH + 1, column - PATCH : column + PATCH + 1]
     span = reach + PATCH
     middle = line + shift[1], column + shift[0]

@@ -77,10 +77,10 @@ def unusable(evidence: Evidence) -> str:
         return evidence.unusable
     if not evidence.is_external and evidence.moving.mean() < LEAST_MOVING:
         return f"only {evidence.moving.mean():.1%} of the pixels show moving objects"
-    covered = coverage(evidence)
-    if covered < LEAST_COVERAGE:
+    share = coverage(evidence)
+    if share < LEAST_COVERAGE:
         return (
-            f"only {covered:.0%} of the moving pixels are near a track that is long "
+            f"only {share:.0%} of the moving pixels are near a track that is long "
             f"enough to fit a motion (at least {LEAST_COVERAGE:.0%} are needed)"
         )
     return ""
@@ -130,13 +130,13 @@ def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
         return True
     if evidence.is_external or evidence.unusable or not unusable(evidence):
         return False
-    marked = float(evidence.moving.mean())
-    if marked < MARKED:
+    moving_share = float(evidence.moving.mean())
+    if moving_share < MARKED:
         return True
     # Objects may be too fast to be tracked, but then some of many tracks start on them.
-    followed = len(evidence.score) >= LEAST_TRACKS
+    has_tracks = len(evidence.score) >= LEAST_TRACKS
     moves = float((evidence.score > record.MOVES).mean()) > FALSE_SHARE
-    return followed and not moves and marked < MOST_MARKED
+    return has_tracks and not moves and moving_share < MOST_MARKED
 
 
 def known_paths(evidence: Evidence) -> KnownPaths:
@@ -150,9 +150,9 @@ def known_paths(evidence: Evidence) -> KnownPaths:
     """
     usable = _is_known(evidence)
     paths = [part[usable] for part in evidence.paths]
-    position, known, _, deviation, is_rigid = paths
+    position, is_known, _, deviation, is_rigid = paths
     tracks = evidence.path_tracks.take(usable)
-    return KnownPaths(position, known, deviation, is_rigid, tracks)
+    return KnownPaths(position, is_known, deviation, is_rigid, tracks)
 
 
 def scene_unit(evidence: Evidence) -> float:

@@ -92,7 +92,7 @@ def without_cameras(images: np.ndarray) -> Views:
         image=images,
         gray=gray,
         valid=np.ones((frames, height, width), bool),
-        textured=np.stack([_textured(one) for one in gray]),
+        textured=np.stack([_find_texture(frame) for frame in gray]),
         intrinsics=unknown,
         rotation=unknown,
         position=unknown[:, 0],
@@ -124,7 +124,7 @@ def _views(capture, rows):
         image=image,
         gray=gray,
         valid=valid,
-        textured=valid & np.stack([_textured(one) for one in gray]),
+        textured=valid & np.stack([_find_texture(frame) for frame in gray]),
         intrinsics=np.stack([_matrix(cameras, row) for row in rows]),
         rotation=cameras.camera_from_world[rows].astype(np.float64),
         position=cameras.position[rows].astype(np.float64),
@@ -144,21 +144,21 @@ def smaller(views: Views, factor: int) -> Views:
     if factor == 1:
         return views
     width, height = (side // factor for side in views.size)
-    trimmed = np.s_[:, : height * factor, : width * factor]
+    crop = np.s_[:, : height * factor, : width * factor]
 
-    def shrunk(images):
+    def shrink(images):
         parts = [
-            cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
-            for one in images[trimmed]
+            cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            for image in images[crop]
         ]
         return np.stack(parts)
 
     scale = np.diag([1 / factor, 1 / factor, 1.0])
     return views._replace(
-        image=shrunk(views.image),
-        gray=shrunk(views.gray),
-        valid=shrunk(np.uint8(views.valid)) > 0,
-        textured=shrunk(np.uint8(views.textured)) > 0,
+        image=shrink(views.image),
+        gray=shrink(views.gray),
+        valid=shrink(np.uint8(views.valid)) > 0,
+        textured=shrink(np.uint8(views.textured)) > 0,
         intrinsics=scale @ views.intrinsics,
     )
 
@@ -202,10 +202,10 @@ def plain(capture: Capture, rows: np.ndarray) -> np.ndarray:
     behind = near(images.astype(np.float32))
     # Only regions connected to the border, not black spots of an object.
     result = np.zeros_like(behind)
-    for row, one in enumerate(behind):
-        seeds = np.zeros_like(one)
+    for row, mask in enumerate(behind):
+        seeds = np.zeros_like(mask)
         seeds[[0, -1]], seeds[:, [0, -1]] = True, True
-        result[row] = nd.binary_propagation(seeds & one, mask=one)
+        result[row] = nd.binary_propagation(seeds & mask, mask=mask)
     return result
 
 
@@ -334,7 +334,7 @@ def _matrix(cameras, row):
     )
 
 
-def _textured(gray):
+def _find_texture(gray):
     """Find pixels that vary in every direction, so that there is no aperture problem.
 
     The criterion is the smaller eigenvalue of the structure tensor over 2 px.

@@ -43,8 +43,8 @@ def is_wide(views: Views, pair: tuple[int, int], flow: np.ndarray) -> bool:
     Returns:
       True for large displacements.
     """
-    one, other = (views.rotation[index, 2] for index in pair)
-    if one @ other < np.cos(MOST_TURN_RAD):
+    first, second = (views.rotation[index, 2] for index in pair)
+    if first @ second < np.cos(MOST_TURN_RAD):
         return False
     length = np.linalg.norm(flow[::4, ::4], axis=-1)
     return float(np.median(length)) > WIDE_SHARE * flow.shape[1]
@@ -80,10 +80,10 @@ def improved(
     inverse = share / span[0] + (1 - share) / span[1]
     best, lowest = flow.copy(), OWN * unlike(images, flow)
     for depth in 1 / inverse:
-        guided = search(_plane_flow(views, pair, depth))
-        cost = unlike(images, guided)
+        candidate = search(_plane_flow(views, pair, depth))
+        cost = unlike(images, candidate)
         better = cost < lowest
-        best[better], lowest[better] = guided[better], cost[better]
+        best[better], lowest[better] = candidate[better], cost[better]
     return best
 
 
@@ -112,10 +112,10 @@ def unlike(images, flow):
     Returns:
       Differences in gray levels, [height, width].
     """
-    one, other = images
-    height, width = one.shape
+    first, second = images
+    height, width = first.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
     at = x + flow[..., 0], y.astype(np.float32) + flow[..., 1]
     # Positions outside of the image have a large difference.
-    warped = cv2.remap(np.float32(other), *at, cv2.INTER_LINEAR, borderValue=-255)
-    return cv2.GaussianBlur(np.abs(one - warped), (0, 0), WINDOW_SHARE * width)
+    image = cv2.remap(np.float32(second), *at, cv2.INTER_LINEAR, borderValue=-255)
+    return cv2.GaussianBlur(np.abs(first - image), (0, 0), WINDOW_SHARE * width)

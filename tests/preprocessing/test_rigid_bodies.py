@@ -237,11 +237,11 @@ def test_slopes_of_misses_are_differences():
     seen = bundle.sight(
         seen_from, tracks_of(seen_from, world), np.ones((POINTS, FRAMES), bool)
     )
-    _, slope, _ = bundle._projected(seen_from, seen, body)
+    _, slope, _ = bundle._reproject(seen_from, seen, body)
     for axis in range(3):
         step = 1e-5 * np.eye(3)[axis]
         ends = [
-            bundle._projected(seen_from, seen, body._replace(shift=body.shift + s))[0]
+            bundle._reproject(seen_from, seen, body._replace(shift=body.shift + s))[0]
             for s in (step, -step)
         ]
         np.testing.assert_allclose(

@@ -77,7 +77,7 @@ def paths_of(grid, begun):
         begun,
         np.ones(len(begun.start)),
     )
-    return record._moved(grid, np.ones(len(grid.start)), moves, 10, (96, 96))
+    return record._select_moving(grid, np.ones(len(grid.start)), moves, 10, (96, 96))
 
 
 def tracks_at(center, count, first=0, last=24):

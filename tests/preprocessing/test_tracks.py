@@ -100,8 +100,8 @@ def test_flow_that_a_thing_lost_is_found_from_how_it_came():
     area = np.s_[20:50, 30:70]
     for frame, shift, seen in ((2, *flow[:2]), (3, *flow[2:])):
         shift[frame][area], seen[frame][area] = 9.0, False
-    assert dense_flow._lost(flow, 2)
-    assert not dense_flow._lost(true, 2)
+    assert dense_flow._is_lost(flow, 2)
+    assert not dense_flow._is_lost(true, 2)
     search = dense_flow.dis(images.shape[2] // views.size[0])
     dense_flow._continue_motion(flow, 2, images, search)
     for frame, flow_of_frame, exact in (
@@ -409,9 +409,9 @@ def test_detail_everywhere_is_texture_and_no_noise(coarse, rng):
     """As a lawn's; noise of as many levels is of single pixels and has no slopes."""
     gray = nd.gaussian_filter(rng.normal(size=(90, 120)), coarse)
     gray = np.float32(0.5 + 0.15 * gray / gray.std())
-    assert view_set._textured(gray).mean() > 0.5
+    assert view_set._find_texture(gray).mean() > 0.5
     plain = np.float32(0.5 + 4 / 255 * rng.normal(size=(90, 120)))
-    assert view_set._textured(plain).mean() < 0.05
+    assert view_set._find_texture(plain).mean() < 0.05
 
 
 def test_a_long_video_has_no_more_places_than_memory_holds(monkeypatch):
