@@ -490,7 +490,7 @@ def _read_cache(folder):
     from nerfies_jax.capture import cache_files
     from nerfies_jax.runtime import console
 
-    cache_files._reported.clear()
+    cache_files._warnings.clear()
     warn, console.warn = console.warn, lambda words: None
     try:
         cache_files.read(

@@ -85,8 +85,8 @@ def read(
     is_train = rows < len(split.train)
     full = image_files.read_header(files[0]).size
     _, shrink_by = frames.choose_source({1: root}, full, factor, max_side, where)
-    loaded = frames.read_frames(files, shrink_by, background)
-    images, alpha = loaded.images, loaded.alpha
+    sequence = frames.read_frames(files, shrink_by, background)
+    images, alpha = sequence.images, sequence.alpha
     if alpha is not None and not alpha.any():
         raise CaptureError(
             f"{where}: all pixels of all images are transparent (alpha 0); save them "
@@ -98,12 +98,12 @@ def read(
     if split.transforms.ply_file_path is not None:
         points = read_ply(named_file(root, split.transforms.ply_file_path, split.file))
     size = images.shape[2:0:-1]
-    placement, more = _place(cameras, points, split.transforms, size)
+    placement, placement_notes = _place(cameras, points, split.transforms, size)
     offset = cameras.position - placement.center
     times, camera_ids, time_notes = _times(entries, split)
     if camera_ids is None:
         camera_ids = _camera_ids(entries, times, split, is_train)
-    valid, masked = _valid(root, entries, split.file, size, shrink_by)
+    valid, mask_notes = _valid(root, entries, split.file, size, shrink_by)
     return Capture(
         name=root.resolve().name,
         source="blender",
@@ -120,7 +120,7 @@ def read(
         warp_ids=splits.dense(times),
         appearance_ids=np.zeros(len(rows), np.int32),
         camera_ids=camera_ids,
-        valid=frames.both(valid, loaded.observed),
+        valid=frames.both(valid, sequence.observed),
         points=_in_scene_units(points, placement),
         background=background if alpha is not None else split.transforms.background,
         scale=placement.scale,
@@ -134,10 +134,10 @@ def read(
             *moved_notes,
             *skip_notes,
             *notes,
-            *more,
+            *placement_notes,
             *time_notes,
-            *masked,
-            *loaded.notes,
+            *mask_notes,
+            *sequence.notes,
             *_unread_depths(entries),
         ),
     )
@@ -265,10 +265,10 @@ def _place(cameras, points, transforms, size):
 
 def _times(entries, split):
     """Stored times, or else times and cameras from the names, and notes."""
-    stored = [entry.time for entry in entries]
+    entry_times = [entry.time for entry in entries]
     count = len(entries)
-    if all(time is not None for time in stored):
-        times = np.array(stored, np.float32)
+    if all(time is not None for time in entry_times):
+        times = np.array(entry_times, np.float32)
         bad = ~((times >= 0) & (times <= 1))
         if bad.any():
             row = int(np.argmax(bad))

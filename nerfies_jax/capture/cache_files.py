@@ -30,7 +30,7 @@ DAMAGED = ".damaged"  # suffix of a damaged file that is kept
 Content = TypeVar("Content")
 
 # Warnings that were printed, since a file may be requested many times.
-_reported: set[tuple[str, Any]] = set()
+_warnings: set[tuple[str, Any]] = set()
 
 
 def read(
@@ -65,8 +65,8 @@ def read(
         with contextlib.suppress(OSError):
             os.replace(path, backup)
             message += f", and kept as {backup.name}"
-    if (key := (message, _state(path))) not in _reported:
-        _reported.add(key)
+    if (key := (message, _state(path))) not in _warnings:
+        _warnings.add(key)
         console.warn(message)
     return None
 
@@ -129,17 +129,17 @@ def evict(folder: pathlib.Path, most_bytes: float | int) -> list[pathlib.Path]:
             with contextlib.suppress(OSError):
                 if entry.is_file(follow_symlinks=False) and entry.name[0] != ".":
                     status = entry.stat(follow_symlinks=False)
-                    used = max(status.st_atime_ns, status.st_mtime_ns)
-                    files.append((used, entry.path, status.st_size))
-    total, removed = sum(size for *_, size in files), []
+                    use_time = max(status.st_atime_ns, status.st_mtime_ns)
+                    files.append((use_time, entry.path, status.st_size))
+    total, removed_files = sum(size for *_, size in files), []
     for _, path, size in sorted(files)[:-1]:
         if total <= most_bytes:
             break
         with contextlib.suppress(OSError):  # Windows keeps files that are open
             os.unlink(path)
             total -= size
-            removed.append(pathlib.Path(path))
-    return removed
+            removed_files.append(pathlib.Path(path))
+    return removed_files
 
 
 def _state(path):

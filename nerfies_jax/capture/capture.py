@@ -292,11 +292,11 @@ def _check_rows(capture, where, frames):
             raise CaptureError(f"{where}: {name} names a row twice")
     if not capture.train.size:
         raise CaptureError(f"{where}: no training frames; hold out fewer frames")
-    shared = np.intersect1d(capture.train, capture.heldout)
-    if shared.size:
+    shared_rows = np.intersect1d(capture.train, capture.heldout)
+    if shared_rows.size:
         raise CaptureError(
-            f"{where}: frame {capture.ids[shared[0]]!r} is both a training and a "
-            f"held-out frame ({shared.size} such); keep it in one of the splits"
+            f"{where}: frame {capture.ids[shared_rows[0]]!r} is both a training and a "
+            f"held-out frame ({shared_rows.size} such); keep it in one of the splits"
         )
 
 
@@ -392,8 +392,8 @@ def blocks(array, factor):
       A view [..., rows, factor, columns, factor] without incomplete blocks.
     """
     rows, columns = array.shape[-2] // factor, array.shape[-1] // factor
-    trimmed = array[..., : rows * factor, : columns * factor]
-    return trimmed.reshape(*array.shape[:-2], rows, factor, columns, factor)
+    crop = array[..., : rows * factor, : columns * factor]
+    return crop.reshape(*array.shape[:-2], rows, factor, columns, factor)
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:

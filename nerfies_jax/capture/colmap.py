@@ -73,8 +73,8 @@ def read(
     path = pathlib.Path(path)
     folder, notes = _best_model(path)
     model, moved_notes = _with_local_names(path, read_model(folder))
-    model, more = _with_physical_cameras(model)
-    notes += (*moved_notes, *more)
+    model, lens_notes = _with_physical_cameras(model)
+    notes += (*moved_notes, *lens_notes)
     if isinstance(heldout, str):
         raise CaptureError(
             f"{path}: COLMAP has no split {heldout!r}; pass a number n to hold out "
@@ -84,11 +84,11 @@ def read(
         path, model, factor, max_side, missing
     )
     # COLMAP reads pixels as stored and ignores the EXIF orientation.
-    loaded = frames.read_frames(files, shrink_by, orientation="stored")
-    images, valid, moving, lenses, more = _as_pinholes(
-        path, model, files, loaded, shrink_by
+    sequence = frames.read_frames(files, shrink_by, orientation="stored")
+    images, valid, moving, lenses, pixel_notes = _as_pinholes(
+        path, model, files, sequence, shrink_by
     )
-    notes += (*loaded.notes, *more)
+    notes += (*sequence.notes, *pixel_notes)
     placement = place_by_points(model.points, model.positions, model.depths)
     center, scale = np.array(placement.center), placement.scale
     cameras = _cameras(lenses, model.rotations, (model.positions - center) * scale)
@@ -171,13 +171,13 @@ def _with_images(path, model, factor, max_side, missing):
     )
 
 
-def _as_pinholes(path, model, files, stored, shrink_by):
+def _as_pinholes(path, model, files, sequence, shrink_by):
     """Images and masks with supported lenses, and notes."""
-    images, valid = stored.images, stored.valid()
+    images, valid = sequence.images, sequence.valid()
     size = (images.shape[2], images.shape[1])
-    moving, masked = _masks(path, model.names, size, shrink_by)
+    moving, mask_notes = _masks(path, model.names, size, shrink_by)
     valid, notes = without_black_borders(images, valid)
-    notes += masked
+    notes += mask_notes
     full = image_files.read_header(files[0]).size
     lenses = [_scale(lens, full, size, path) for lens in model.lenses]
     fisheyes = {_is_fisheye(lens) for lens in lenses}
@@ -268,20 +268,20 @@ def _best_model(path):
         )
     if len(folders) == 1:
         return folders[0], ()
-    counts, broken = {}, {}
+    counts, errors = {}, {}
     for folder in folders:
         try:
             counts[folder] = len(colmap_models.tables(folder).about["names"])
         except CaptureError as error:
-            broken[folder] = error
+            errors[folder] = error
     if not counts:
-        raise next(iter(broken.values()))
+        raise next(iter(errors.values()))
     notes = tuple(
-        f"skipped: {error}".replace(f"{path}/", "") for error in broken.values()
+        f"skipped: {error}".replace(f"{path}/", "") for error in errors.values()
     )
     if len(counts) > 1:
-        listed = ", ".join(f"{p.name}: {n}" for p, n in counts.items())
-        notes = (f"several models, the largest is read (images: {listed})", *notes)
+        listing = ", ".join(f"{p.name}: {n}" for p, n in counts.items())
+        notes = (f"several models, the largest is read (images: {listing})", *notes)
     return max(counts, key=counts.get), notes
 
 
@@ -308,10 +308,10 @@ def _find_images(path, model):
         if ratio not in available:
             available[ratio], paths[ratio] = path / subfolder, files
     if not available:
-        listed = ", ".join(folder or "the folder itself" for folder in IMAGE_FOLDERS)
+        listing = ", ".join(folder or "the folder itself" for folder in IMAGE_FOLDERS)
         raise CaptureError(
             f"{path}: a COLMAP model but none of its images ({model.names[0]}, ...); "
-            f"looked in {listed}"
+            f"looked in {listing}"
         )
     return available, paths
 
@@ -352,24 +352,24 @@ def _masks(path, names, size, shrink_by):
     return white < 1, notes
 
 
-def _scale(lens, stored, size, path):
+def _scale(lens, stored_size, size, path):
     """Return the lens for images of `size`, which are downscaled stored images."""
     if lens.is_spherical():
         raise CaptureError(
             f"{path}: camera {lens.camera_id} is {lens.model_name}, a full panorama; "
             "convert it to perspective images first"
         )
-    ratio = max(1, round(lens.width / stored[0]))
-    trimmed = abs(np.array((lens.width, lens.height)) / ratio - stored)
-    if trimmed.max() >= 1:
+    ratio = max(1, round(lens.width / stored_size[0]))
+    mismatch = abs(np.array((lens.width, lens.height)) / ratio - stored_size)
+    if mismatch.max() >= 1:
         raise CaptureError(
             f"{path}: camera {lens.camera_id} is for {lens.width}x{lens.height} "
-            f"pixels, but its images have {stored[0]}x{stored[1]}; images must be an "
-            "integer fraction of that"
+            f"pixels, but its images have {stored_size[0]}x{stored_size[1]}; images "
+            "must be an integer fraction of that"
         )
     copy = library().Camera(lens.todict())
-    copy.rescale(*stored)
-    shrink_by = stored[0] // size[0]
+    copy.rescale(*stored_size)
+    shrink_by = stored_size[0] // size[0]
     # Incomplete blocks are cropped at the right and bottom only.
     copy.width, copy.height = size[0] * shrink_by, size[1] * shrink_by
     copy.rescale(*size)

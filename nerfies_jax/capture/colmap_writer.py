@@ -38,11 +38,11 @@ def write(
     """
     check_names(capture, path)
     refuse_skew(capture, path, "a COLMAP model")
-    spaced = [name for name in capture.ids if len(name.split()) != 1]
-    if spaced:
+    bad_names = [name for name in capture.ids if len(name.split()) != 1]
+    if bad_names:
         raise CaptureError(
-            f"{path}: the name of frame {spaced[0]!r} has a space, which COLMAP's text "
-            "format cannot hold; rename it, or export transforms"
+            f"{path}: the name of frame {bad_names[0]!r} has a space, which COLMAP's "
+            "text format cannot hold; rename it, or export transforms"
         )
     with replaced_folder(path, overwrite) as folder:
         model = folder / "sparse" / "0"
@@ -59,11 +59,11 @@ def write(
         numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), 1)}
         lines = (f"{number} {lens}" for lens, number in numbers.items())
         _write_lines(model / "cameras.txt", lines)
-        observed, pixels = _observations(capture)
+        is_observed, pixels = _observations(capture)
         camera_numbers = [numbers[lens] for lens in lenses]
-        lines = _image_lines(capture, units, camera_numbers, observed, pixels)
+        lines = _image_lines(capture, units, camera_numbers, is_observed, pixels)
         _write_lines(model / "images.txt", lines)
-        _write_lines(model / "points3D.txt", _point_lines(capture, units, observed))
+        _write_lines(model / "points3D.txt", _point_lines(capture, units, is_observed))
 
 
 def _write_lines(path, lines):
@@ -121,7 +121,7 @@ def _observations(capture):
     return visible & is_kept, pixels
 
 
-def _image_lines(capture, units, camera_numbers, observed, pixels):
+def _image_lines(capture, units, camera_numbers, is_observed, pixels):
     """Two lines for each frame: its pose, then its observations."""
     rotations = scipy.spatial.transform.Rotation.from_matrix(
         capture.cameras.camera_from_world.astype(np.float64)
@@ -132,12 +132,12 @@ def _image_lines(capture, units, camera_numbers, observed, pixels):
         x, y, z, w = rotations[row].as_quat()
         pose = _text((w, x, y, z, *translations[row]))
         yield f"{row + 1} {pose} {camera_numbers[row]} {name}.png"
-        points = np.flatnonzero(observed[row])
+        points = np.flatnonzero(is_observed[row])
         observations = zip(*pixels[row][points].T, points, strict=True)
         yield " ".join(f"{x:.3f} {y:.3f} {point + 1}" for x, y, point in observations)
 
 
-def _point_lines(capture, units, observed):
+def _point_lines(capture, units, is_observed):
     """A line for each point: position, color, error, and its track.
 
     The track lists the frames and the indices of the observations in their lines.
@@ -145,9 +145,9 @@ def _point_lines(capture, units, observed):
     if capture.points is None:
         return
     positions = places_in(units, capture, capture.points.position)
-    index = np.cumsum(observed, axis=1) - 1
+    index = np.cumsum(is_observed, axis=1) - 1
     for number, color in enumerate(capture.points.color):
-        rows = np.flatnonzero(observed[:, number])
+        rows = np.flatnonzero(is_observed[:, number])
         track = " ".join(f"{row + 1} {index[row, number]}" for row in rows)
         rgb = " ".join(str(int(part)) for part in color)
         # Observations are exact projections, so the reprojection error is 0.

@@ -121,9 +121,9 @@ class Decoder:
                 complete = True
             except _ReportedError as error:
                 complete = True
-                reported = DecoderError(str(error))
-                reported.has_advice = error.has_advice
-                raise reported from None
+                failure = DecoderError(str(error))
+                failure.has_advice = error.has_advice
+                raise failure from None
             except (OSError, ValueError, EOFError, KeyError, TypeError) as error:
                 reason = self._ending(error)
                 # A signal to the process group ended the child as well.
@@ -211,7 +211,7 @@ def _next_answer(child, seconds):
         timer.cancel()
 
 
-_shared: Decoder | None = None  # serves requests
+_session_decoder: Decoder | None = None  # serves requests
 _spare: Decoder | None = None  # kept for the next stream
 _sessions = 0
 _sessions_lock = threading.Lock()
@@ -224,11 +224,11 @@ def session() -> Iterator[Decoder]:
     Yields:
       The decoder.
     """
-    global _shared, _spare, _sessions
+    global _session_decoder, _spare, _sessions
     with _sessions_lock:
-        _shared = _shared or Decoder()
+        _session_decoder = _session_decoder or Decoder()
         _sessions += 1
-        decoder = _shared
+        decoder = _session_decoder
     try:
         yield decoder
     finally:
@@ -236,7 +236,7 @@ def session() -> Iterator[Decoder]:
             _sessions -= 1
             if not _sessions:
                 decoder.close()
-                _shared = None
+                _session_decoder = None
                 if _spare is not None:
                     _spare.close()
                     _spare = None

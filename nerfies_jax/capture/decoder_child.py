@@ -27,15 +27,15 @@ def _limit(cpu_seconds, memory_bytes):
     """Bound the further processor time and memory of this process."""
     if resource is None:
         return
-    spent = time.process_time()
+    cpu_time = time.process_time()
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
     with contextlib.suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_CPU, (int(spent + cpu_seconds) + 1, hard))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_time + cpu_seconds) + 1, hard))
     with contextlib.suppress(ValueError, OSError):
         with open("/proc/self/statm") as file:
-            now = int(file.read().split()[0]) * resource.getpagesize()
+            size_bytes = int(file.read().split()[0]) * resource.getpagesize()
         _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (now + int(memory_bytes), hard))
+        resource.setrlimit(resource.RLIMIT_AS, (size_bytes + int(memory_bytes), hard))
 
 
 def _colmap(folder):
@@ -144,12 +144,12 @@ def main() -> None:
         # Imported first, since the limit of memory excludes libraries.
         importlib.import_module(module)
         try:
-            spent = time.process_time()
+            start_time = time.process_time()
             _limit(job["cpu_seconds"], job["memory_bytes"])
             for about, arrays in operation(**job["arguments"]):
                 _answer(answers, about, arrays)
-                if time.process_time() - spent > 1.0:  # the limit holds per answer
-                    spent = time.process_time()
+                if time.process_time() - start_time > 1.0:  # the limit holds per answer
+                    start_time = time.process_time()
                     _limit(job["cpu_seconds"], job["memory_bytes"])
             _say(answers, {"end": True})
         # Decoders may raise anything. The parent adds the path.

@@ -156,21 +156,21 @@ def _already(folder, address, sha256):
 
 def _fetch(address, path):
     """Load a file. Return its SHA-256 and size."""
-    digest, done = hashlib.sha256(), 0
+    digest, size = hashlib.sha256(), 0
     request = urllib.request.Request(address, headers={"User-Agent": "nerfies-jax"})
     try:
         with (
             urllib.request.urlopen(request, timeout=TIMEOUT_SECONDS) as answer,
             path.open("wb") as file,
         ):
-            expected = int(answer.headers.get("Content-Length") or 0)
-            _check_room(address, path, expected)
-            total = max(1, -(-expected // CHUNK_BYTES)) if expected else None
+            expected_size = int(answer.headers.get("Content-Length") or 0)
+            _check_room(address, path, expected_size)
+            total = max(1, -(-expected_size // CHUNK_BYTES)) if expected_size else None
             with events.stage("downloading", total) as stage:
                 while chunk := answer.read(CHUNK_BYTES):
                     stopping.check()
-                    done += len(chunk)
-                    if done > MOST_BYTES:
+                    size += len(chunk)
+                    if size > MOST_BYTES:
                         raise CaptureError(f"{address}: more than {MOST_BYTES} bytes")
                     digest.update(chunk)
                     file.write(chunk)
@@ -179,20 +179,20 @@ def _fetch(address, path):
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise CaptureError(f"{address}: cannot be downloaded ({error})") from error
-    if expected and done != expected:
+    if expected_size and size != expected_size:
         raise CaptureError(
-            f"{address}: the connection ended after {done} of {expected} bytes; try "
-            "again"
+            f"{address}: the connection ended after {size} of {expected_size} bytes; "
+            "try again"
         )
-    return digest.hexdigest(), done
+    return digest.hexdigest(), size
 
 
-def _check_room(address, path, expected):
+def _check_room(address, path, expected_size):
     free = shutil.disk_usage(path.parent).free
-    if 2 * expected > free:
+    if 2 * expected_size > free:
         raise CaptureError(
-            f"{address}: {expected / 1e9:.1f} GB to load and as much to unpack, but "
-            f"{free / 1e9:.1f} GB are free; choose a folder on another disk"
+            f"{address}: {expected_size / 1e9:.1f} GB to load and as much to unpack, "
+            f"but {free / 1e9:.1f} GB are free; choose a folder on another disk"
         )
 
 
@@ -201,8 +201,8 @@ def _unpack(address, archive, folder):
     root = folder.resolve()
     most = MOST_RATIO * archive.stat().st_size + CHUNK_BYTES
     try:
-        with zipfile.ZipFile(archive) as opened:
-            members = [each for each in opened.infolist() if not each.is_dir()]
+        with zipfile.ZipFile(archive) as zip_file:
+            members = [each for each in zip_file.infolist() if not each.is_dir()]
             if len(members) > MOST_FILES or sum(x.file_size for x in members) > most:
                 raise CaptureError(
                     f"{address}: its {len(members)} files would take more than "
@@ -220,7 +220,7 @@ def _unpack(address, archive, folder):
                         "out of the folder, so it is not unpacked"
                     )
                 target.parent.mkdir(parents=True, exist_ok=True)
-                with opened.open(member) as source, target.open("xb") as file:
+                with zip_file.open(member) as source, target.open("xb") as file:
                     while chunk := source.read(CHUNK_BYTES):
                         remaining -= len(chunk)
                         if remaining < 0:

@@ -72,8 +72,8 @@ def undistorted(
         if array is None:
             continue
         parts[name] = np.full((len(array), *size[::-1], 2), NOWHERE, np.float32)
-        for one, other in frames:
-            parts[name][one] = _flow(array[one], sources(one), other, straight)
+        for row, other in frames:
+            parts[name][row] = _flow(array[row], sources(row), other, straight)
     return external._replace(size=size, **parts)
 
 

@@ -55,11 +55,11 @@ def validate(
     count = len(ids)
     full_shape = (count, size[1], size[0])
     for name, shift, valid, rows in sides(flow):
-        expected = (
+        layouts = (
             (shift, np.float32, (*full_shape, 2)),
             (valid, np.bool_, full_shape),
         )
-        for array, dtype, shape in expected:
+        for array, dtype, shape in layouts:
             if array.shape != shape or array.dtype != dtype:
                 raise ValueError(
                     f"{name} flow is {array.dtype} of shape {array.shape}; expected "
@@ -157,11 +157,11 @@ def shrink_one(
       block is valid.
     """
     rows, columns = valid.shape[0] // factor, valid.shape[1] // factor
-    cropped = np.s_[: rows * factor, : columns * factor]
+    crop = np.s_[: rows * factor, : columns * factor]
     blocks = (rows, factor, columns, factor)
-    mean = shift[cropped].reshape(*blocks, 2).mean((1, 3), dtype=np.float64)
-    whole = np.all(valid[cropped].reshape(blocks), axis=(1, 3))
-    return (mean / factor).astype(np.float32), whole
+    mean = shift[crop].reshape(*blocks, 2).mean((1, 3), dtype=np.float64)
+    all_valid = np.all(valid[crop].reshape(blocks), axis=(1, 3))
+    return (mean / factor).astype(np.float32), all_valid
 
 
 def training_flow(capture) -> FrameFlow | None:

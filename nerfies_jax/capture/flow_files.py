@@ -30,9 +30,9 @@ def write(flow: FrameFlow, ids: Sequence[str], folder: pathlib.Path, factor: int
     for name, shift, valid, rows in flows.sides(flows.shrink(flow, factor)):
         target = folder / f"{factor}x" / name
         target.mkdir(parents=True, exist_ok=True)
-        paired = np.flatnonzero(rows != np.arange(len(rows))).tolist()
-        neighbors[name] = {ids[row]: ids[rows[row]] for row in paired}
-        for row in paired:
+        pair_rows = np.flatnonzero(rows != np.arange(len(rows))).tolist()
+        neighbors[name] = {ids[row]: ids[rows[row]] for row in pair_rows}
+        for row in pair_rows:
             array = np.concatenate([shift[row], valid[row, ..., None]], axis=-1)
             array = array.astype(np.float32)
             np.save(target / f"{ids[row]}.npy", array, allow_pickle=False)

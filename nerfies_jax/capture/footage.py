@@ -119,10 +119,10 @@ def from_video(
     if len(np.unique(milliseconds)) < OWN_TIMES * len(milliseconds):
         raise CaptureError(f"{video}: its frames have no times; encode it again")
     count = _frame_count(video, times, count, per_second)
-    selected, blurred = sharp_rows(scores, times, count)
-    selected = selected[np.unique(milliseconds[selected], return_index=True)[1]]
+    selection, blur_count = sharp_rows(scores, times, count)
+    selection = selection[np.unique(milliseconds[selection], return_index=True)[1]]
     sources = None if masks is None else _masks_of_video(masks, len(times))
-    names, rows, white = [], selected.tolist(), []  # rows are in ascending order
+    names, rows, white = [], selection.tolist(), []  # rows are in ascending order
     if sources is not None:
         sources = {row: sources[row] for row in rows}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
@@ -138,17 +138,21 @@ def from_video(
                 white.append(mask.mean())
                 _write_mask(out, names[-1], mask, frame.shape, factor, source)
             stage.advance()
-    notes = [f"{len(selected)} of {len(scores)} frames selected, {blurred} too blurred"]
+    notes = [
+        f"{len(selection)} of {len(scores)} frames selected, {blur_count} too blurred"
+    ]
     notes += notes_of(video, len(scores), float(times[-1]))
     transfer = transfer_of(video)
     if transfer is not None:
         notes.append(f"video in high dynamic range ({transfer}), tone-mapped to sRGB")
     if sources is not None:
-        used = [*sources.values()]
+        mask_paths = [*sources.values()]
         notes.append(
-            mask_files.describe(used, len(used), encoding, np.mean(white), "moving")
+            mask_files.describe(
+                mask_paths, len(mask_paths), encoding, np.mean(white), "moving"
+            )
         )
-    return SourceImages(tuple(names), tuple(notes), float(np.ptp(times[selected])))
+    return SourceImages(tuple(names), tuple(notes), float(np.ptp(times[selection])))
 
 
 def _frame_count(path, times, count, per_second):
@@ -206,47 +210,49 @@ def from_images(
     headers, notes = _readable(folder)
     sizes = collections.Counter(header.size for header in headers.values())
     size = sizes.most_common(1)[0][0]
-    selected = [file for file in headers if headers[file].size == size]
-    others = [file.name for file in headers if headers[file].size != size]
-    notes += _left_out_note(others, f"not of {size[0]}x{size[1]} pixels like most")
-    stems = collections.Counter(_encodable(file.stem) for file in selected)
+    files = [file for file in headers if headers[file].size == size]
+    other_names = [file.name for file in headers if headers[file].size != size]
+    notes += _left_out_note(other_names, f"not of {size[0]}x{size[1]} pixels like most")
+    stems = collections.Counter(_encodable(file.stem) for file in files)
     stem, count = stems.most_common(1)[0]
     if count > 1:
         raise CaptureError(f"{folder}: {count} images are named {stem}; keep one")
-    factor, broken, used, white = _factor(size, max_side), [], [], []
+    factor, broken_files, mask_paths, white = _factor(size, max_side), [], [], []
     if masks is not None:
-        sources = {file: _mask_of(masks, file) for file in selected}
+        sources = {file: _mask_of(masks, file) for file in files}
         encoding = mask_files.find_encoding([*sources.values()], "upright")
-    with events.stage("reading images", len(selected)) as stage:
-        for file in selected:
+    with events.stage("reading images", len(files)) as stage:
+        for file in files:
             stage.advance()
             try:
                 color = photographs.read_upright(file)
             except photographs.Unreadable:  # damaged after its header
-                broken.append(file)
+                broken_files.append(file)
                 continue
             name = f"{_encodable(file.stem)}.png"
             _write(out / "images" / name, shrink(color, factor))
             if masks is not None:
-                used.append(sources[file])
-                mask = mask_files.read_mask(used[-1], encoding, "upright")
+                mask_paths.append(sources[file])
+                mask = mask_files.read_mask(mask_paths[-1], encoding, "upright")
                 white.append(mask.mean())
-                _write_mask(out, name, mask, color.shape, factor, used[-1])
-    notes += _left_out_note([file.name for file in broken], _BROKEN)
-    selected = [file for file in selected if file not in broken]
-    count = len(selected)
+                _write_mask(out, name, mask, color.shape, factor, mask_paths[-1])
+    notes += _left_out_note([file.name for file in broken_files], _BROKEN)
+    files = [file for file in files if file not in broken_files]
+    count = len(files)
     _check_enough(folder, count, notes)
     if masks is not None:
-        note = mask_files.describe(used, count, encoding, np.mean(white), "moving")
+        note = mask_files.describe(
+            mask_paths, count, encoding, np.mean(white), "moving"
+        )
         notes += (note,)
-    names = tuple(f"{_encodable(file.stem)}.png" for file in selected)
-    focals = [headers[file].focal for file in selected]
-    stated = [focal for focal in focals if focal is not None]
+    names = tuple(f"{_encodable(file.stem)}.png" for file in files)
+    focals = [headers[file].focal for file in files]
+    known_focals = [focal for focal in focals if focal is not None]
     by_camera = collections.defaultdict(list)
-    for name, file in zip(names, selected, strict=True):
+    for name, file in zip(names, files, strict=True):
         by_camera[headers[file].camera, headers[file].focal].append(name)
     groups = tuple((tuple(group), focal) for (_, focal), group in by_camera.items())
-    focal = float(np.median(stated)) if stated else None
+    focal = float(np.median(known_focals)) if known_focals else None
     return SourceImages(names, notes, focal=focal, groups=groups)
 
 
@@ -260,15 +266,15 @@ def _readable(folder):
             heic_names, "HEIC, which needs pip install 'nerfies-jax[heic]'"
         )
         files = [file for file in files if file.name not in heic_names]
-    headers, broken, large = {}, [], []
+    headers, broken_names, large_names = {}, [], []
     for file in files:
         try:
             headers[file] = photographs.read_header(file)
         except photographs.Unreadable:
-            broken.append(file.name)
+            broken_names.append(file.name)
         except photographs.TooLarge:
-            large.append(file.name)
-    notes += _left_out_note(broken, _BROKEN) + _left_out_note(large, _LARGE)
+            large_names.append(file.name)
+    notes += _left_out_note(broken_names, _BROKEN) + _left_out_note(large_names, _LARGE)
     _check_enough(folder, len(headers), notes)
     return headers, notes
 
@@ -284,9 +290,9 @@ def _check_enough(folder, count, notes):
 def _left_out_note(names, reason):
     if not names:
         return ()
-    listed = ", ".join(map(_encodable, names[:5]))
-    listed += ", ..." if len(names) > 5 else ""
-    return (f"{len(names)} images left out, {reason}: {listed}",)
+    listing = ", ".join(map(_encodable, names[:5]))
+    listing += ", ..." if len(names) > 5 else ""
+    return (f"{len(names)} images left out, {reason}: {listing}",)
 
 
 def _encodable(name):
@@ -335,8 +341,8 @@ def sharpness(gray: np.ndarray) -> float:
       The variance.
     """
     step = max(1, max(gray.shape) // 480)
-    reduced = gray[::step, ::step].astype(np.float32)
-    return float(scipy.ndimage.laplace(reduced).var())
+    thumbnail = gray[::step, ::step].astype(np.float32)
+    return float(scipy.ndimage.laplace(thumbnail).var())
 
 
 def sharp_rows(

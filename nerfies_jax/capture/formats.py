@@ -50,8 +50,8 @@ def sparse_models(path: pathlib.Path, part: str = "images") -> list[pathlib.Path
     """
     for name in MODELS:
         parent = path / name
-        numbered = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
-        folders = (*sorted(numbered, key=lambda p: int(p.name)), parent)
+        subfolders = [p for p in parent.glob("*") if p.is_dir() and p.name.isdecimal()]
+        folders = (*sorted(subfolders, key=lambda p: int(p.name)), parent)
         models = [
             folder
             for folder in folders
@@ -207,8 +207,8 @@ def recognize(path: AnyPath) -> Format:
             "to them; prepare a single video with nerfies prepare "
             f"video {shlex.quote(str(videos[0]))} OUT"
         )
-    expected = "; ".join(each.looks_for for each in FORMATS)
-    raise CaptureError(f"{path}: no capture here; looked for {expected}")
+    expected_files = "; ".join(each.looks_for for each in FORMATS)
+    raise CaptureError(f"{path}: no capture here; looked for {expected_files}")
 
 
 def load(

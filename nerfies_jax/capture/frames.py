@@ -146,12 +146,12 @@ def moved_note(names: Sequence[str], local: Sequence[str]) -> tuple[str, ...]:
       A note, or an empty tuple if the names are equal.
     """
     pairs = zip(names, local, strict=True)
-    replaced = [(name, end) for name, end in pairs if name != end]
-    if not replaced:
+    changes = [(name, end) for name, end in pairs if name != end]
+    if not changes:
         return ()
-    name, end = replaced[0]
+    name, end = changes[0]
     return (
-        f"{len(replaced)} file names are paths in another folder ({name}, ...): read "
+        f"{len(changes)} file names are paths in another folder ({name}, ...): read "
         f"from this one ({end}, ...)",
     )
 
@@ -219,13 +219,15 @@ def keep_found(
     absent = [name for name, path in zip(names, paths, strict=True) if path is None]
     if not absent:
         return rows, ()
-    listed = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
+    listing = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
     if missing == "refuse" or not rows.size:
         raise CaptureError(
-            f"{where}: {len(absent)} of {len(names)} images are missing ({listed}); "
+            f"{where}: {len(absent)} of {len(names)} images are missing ({listing}); "
             'restore them, or leave those frames out with missing="skip"'
         )
-    return rows, (f"{len(absent)} frames left out, their images are missing: {listed}",)
+    return rows, (
+        f"{len(absent)} frames left out, their images are missing: {listing}",
+    )
 
 
 class Frames(NamedTuple):
@@ -386,14 +388,14 @@ def read_frames(
             )
     if not unknown:
         return Frames(colors, alpha, None, ())
-    observed = np.ones(colors.shape[:3], bool)
+    observed_mask = np.ones(colors.shape[:3], bool)
     for row, is_observed in unknown.items():
-        observed[row] = is_observed
+        observed_mask[row] = is_observed
     note = (
         f"{len(unknown)} EXR images have pixels outside their data window or not "
-        f"finite, {1 - observed.mean():.1%} of all: taken as not observed"
+        f"finite, {1 - observed_mask.mean():.1%} of all: taken as not observed"
     )
-    return Frames(colors, alpha, observed, (note,))
+    return Frames(colors, alpha, observed_mask, (note,))
 
 
 def read_masks(

@@ -38,9 +38,9 @@ def findings(capture: Capture) -> list[Finding]:
     rotation = np.asarray(capture.cameras.camera_from_world, np.float64)
     position = np.asarray(capture.cameras.position, np.float64) / capture.scale
     position = position + np.array(capture.center)
-    fixed = len(np.unique(capture.cameras.position, axis=0)) < LEAST_FRAMES
+    is_fixed = len(np.unique(capture.cameras.position, axis=0)) < LEAST_FRAMES
     rotates = len(position) >= LEAST_FRAMES and np.ptp(rotation, axis=0).max() > TURNS
-    if fixed and not rotates:
+    if is_fixed and not rotates:
         return []
     look = _look_of(rotation[:, 2], position)
     subject = "common point"

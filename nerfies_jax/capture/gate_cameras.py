@@ -185,8 +185,8 @@ def _fisheye(capture):
     corners = np.indices((17, 17))[::-1] / 16 * np.array(capture.size)[:, None, None]
     shares = []
     for row in np.unique(cameras.fisheye, axis=0, return_index=True)[1]:
-        one = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
-        rays = unproject(one, corners.reshape(2, -1).T.astype(np.float32))[1]
+        camera = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
+        rays = unproject(camera, corners.reshape(2, -1).T.astype(np.float32))[1]
         shares.append(1 - float(np.mean(rays)))
     share = max(shares)
     value = f"fisheye, without rays in {share:.1%} of the image"
@@ -237,17 +237,17 @@ def _find_rounding(capture, position, name):
     steps = np.spacing(np.abs(world).max(0).astype(np.float32)).astype(float)
     # Positions in scene units are float32, which hides any finer rounding.
     resolution = units.float32_step(position) / capture.scale
-    rounded = []
+    rounded_axes = []
     for axis in range(3):
         step = steps[axis] / 2  # spacing at half of the largest coordinate
         multiples = world[:, axis] / step
         on_steps = (np.abs(multiples - np.round(multiples)) < 0.1).mean() >= ON_STEPS
         if step > 20 * resolution and on_steps:
-            rounded.append(axis)
-    step = max(steps[rounded], default=0.0) / 2
+            rounded_axes.append(axis)
+    step = max(steps[rounded_axes], default=0.0) / 2
     step_px = units.in_pixels(capture, step * capture.scale)
     # A constant coordinate may be such a multiple by chance.
-    if step_px < DOUBTFUL_PX or not np.ptp(world[:, rounded], axis=0).any():
+    if step_px < DOUBTFUL_PX or not np.ptp(world[:, rounded_axes], axis=0).any():
         return []
     problem = (
         f"{name} are multiples of {step:.3g} world units, {step_px:.2g} px: "

@@ -74,22 +74,26 @@ def _depths(capture):
     near, far = capture.near, capture.far
     median = float(np.median(sample))
     beyond = float(((sample < near) | (sample > far)).mean())
-    expected = units.usual_depth(capture)
-    ratio = median / expected
+    expected_depth = units.usual_depth(capture)
+    ratio = median / expected_depth
     has_points = units.point_depths(capture).size
     statement = (
         f"the median stored depth is {median:.3g} scene units, {ratio:.3g} times that "
-        + ("of the points" if has_points else f"between near and far ({expected:.3g})")
+        + (
+            "of the points"
+            if has_points
+            else f"between near and far ({expected_depth:.3g})"
+        )
         + f"; near is {near:.3g} and far {far:.3g}"
     )
     value = f"median {median:.3g}, {beyond:.0%} outside near and far"
     if 1 / WRONG_UNITS < ratio < WRONG_UNITS:
         problem = f"{beyond:.0%} of depths: {statement}" if beyond > 0.5 else ""
-        scaled = abs(np.log(capture.scale)) > np.log(2)
-        if problem and scaled and abs(np.log(ratio / capture.scale)) < np.log(1.5):
+        is_scaled = abs(np.log(capture.scale)) > np.log(2)
+        if problem and is_scaled and abs(np.log(ratio / capture.scale)) < np.log(1.5):
             problem += "; they seem to be in scene units, and world units are expected"
         return [Finding(subject, value, problem)]
-    factor, reason = min(UNITS, key=lambda one: abs(np.log(ratio / one[0])))
+    factor, reason = min(UNITS, key=lambda unit: abs(np.log(ratio / unit[0])))
     remedy = "convert the depths to the unit of the cameras or remove them"
     if abs(np.log(ratio / capture.scale)) < abs(np.log(ratio / factor)):
         factor, reason = capture.scale, "the depths are in scene units already"

@@ -69,16 +69,16 @@ def findings(capture: Capture) -> list[Finding]:
         np.asarray(cameras.camera_from_world),
         np.asarray(cameras.position) / capture.scale + np.array(capture.center),
     )
-    projected = _project(cameras, pose, points, capture.size)
-    share, front = projected.inside.mean(), (projected.depth > 0).mean()
-    visible = projected.inside.any(0).mean()
+    projection = _project(cameras, pose, points, capture.size)
+    share, front = projection.inside.mean(), (projection.depth > 0).mean()
+    visible = projection.inside.any(0).mean()
     value = (
         f"{front:.0%} in front of a camera and {share:.0%} inside its image, on average"
     )
     subject = "points"
     if share < DOUBTFUL and visible < SEEN:
-        problem, refused = _explain(capture, cameras, pose, points, share)
-        return [Finding(subject, value, problem, refused)]
+        problem, is_refused = _explain(capture, cameras, pose, points, share)
+        return [Finding(subject, value, problem, is_refused)]
     problem = ""
     if share < CONVINCING:
         readings = _other_conventions(capture, cameras, pose)
@@ -90,10 +90,10 @@ def findings(capture: Capture) -> list[Finding]:
             problem = f"{share:.0%} of the points fall into the images, and " + reason
     return [
         Finding(subject, value, problem),
-        *_spread(capture, projected),
-        *_parallax(pose, projected),
-        *_near_and_far(capture, projected),
-        *_empty_frames(capture, rows, projected),
+        *_spread(capture, projection),
+        *_parallax(pose, projection),
+        *_near_and_far(capture, projection),
+        *_empty_frames(capture, rows, projection),
     ]
 
 
@@ -124,10 +124,10 @@ def _best_reading(readings, capture, points):
     """The largest share of points in the images of any reading, and its reason."""
     shares = {}
     for name, (cameras, pose) in readings.items():
-        projected = _project(cameras, pose, points, capture.size)
+        projection = _project(cameras, pose, points, capture.size)
         # From far enough away all points are visible as a dot.
-        is_dot = max(_extent(capture, projected), default=0.0) < SMALL
-        shares[name] = 0.0 if is_dot else float(projected.inside.mean())
+        is_dot = max(_extent(capture, projection), default=0.0) < SMALL
+        shares[name] = 0.0 if is_dot else float(projection.inside.mean())
     if not shares:
         return 0.0, ""
     best = max(shares, key=shares.get)
@@ -224,19 +224,19 @@ def _other_units(cameras, pose):
     return readings
 
 
-def _extent(capture, projected):
+def _extent(capture, projection):
     """Shares of width and height that 90 % of the points cover. () for few points."""
     extents = []
-    for pixel, inside in zip(projected.pixel, projected.inside, strict=True):
+    for pixel, inside in zip(projection.pixel, projection.inside, strict=True):
         if inside.sum() >= LEAST_POINTS:
             low, high = np.quantile(pixel[inside], (0.05, 0.95), axis=0)
             extents.append((high - low) / np.array(capture.size))
     return np.median(extents, axis=0) if extents else ()
 
 
-def _spread(capture, projected):
+def _spread(capture, projection):
     """Check if all points lie in a small part of the images, as in a wrong unit."""
-    extent = _extent(capture, projected)
+    extent = _extent(capture, projection)
     if not len(extent):
         return []
     x, y = extent
@@ -252,10 +252,10 @@ def _spread(capture, projected):
     return [Finding("points cover", value, problem)]
 
 
-def _parallax(pose, projected):
+def _parallax(pose, projection):
     """Check if the camera path is so short that its unit must be another one."""
     extent = float(np.linalg.norm(np.ptp(pose.position, axis=0)))
-    depths = projected.depth[projected.inside]
+    depths = projection.depth[projection.inside]
     if extent == 0 or not depths.size:
         return []
     ratio = extent / float(np.median(depths))
@@ -269,9 +269,9 @@ def _parallax(pose, projected):
     return [Finding("cameras move by", f"{ratio:.2g} of the median depth", problem)]
 
 
-def _near_and_far(capture, projected):
+def _near_and_far(capture, projection):
     """Check that the visible points lie between near and far."""
-    depths = projected.depth[projected.inside] * capture.scale
+    depths = projection.depth[projection.inside] * capture.scale
     if not depths.size:
         return []
     near, far = capture.near, capture.far
@@ -293,9 +293,9 @@ def _near_and_far(capture, projected):
     return [Finding(subject, value, problem, beyond > 0.95)]
 
 
-def _empty_frames(capture, rows, projected):
+def _empty_frames(capture, rows, projection):
     """Frames that show hardly any points, compared with the other frames."""
-    counts = projected.inside.sum(1)
+    counts = projection.inside.sum(1)
     median = np.median(counts)
     is_few = median < 2 * LEAST_POINTS  # a frame may have none by chance
     empty = rows[:0] if is_few else rows[counts < DOUBTFUL * median]

@@ -55,8 +55,8 @@ def tone_mapped(code: np.ndarray, transfer: Transfer) -> np.ndarray:
         nits = scene * gain[..., None].astype(np.float32)
     # The brightest channel sets the gain of all three, which preserves the hue.
     brightest = nits.max(axis=-1)
-    compressed = _roll_off()[_table_index(brightest, BRIGHTEST_NITS)]
-    display = nits * (compressed / np.maximum(brightest, 1e-3))[..., None]
+    display_peak = _roll_off()[_table_index(brightest, BRIGHTEST_NITS)]
+    display = nits * (display_peak / np.maximum(brightest, 1e-3))[..., None]
     linear = display @ _TO_SRGB.T / WHITE_NITS
     return _srgb_bytes()[_table_index(linear, 1.0)]
 
@@ -109,5 +109,5 @@ def _roll_off():
 
 @functools.cache
 def _srgb_bytes():
-    encoded = srgb_from_linear(np.linspace(0, 1, CODES))
-    return np.round(255 * encoded).astype(np.uint8)
+    srgb = srgb_from_linear(np.linspace(0, 1, CODES))
+    return np.round(255 * srgb).astype(np.uint8)

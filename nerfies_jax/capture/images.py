@@ -343,9 +343,9 @@ def write_png(path: AnyPath, pixels: np.ndarray):
         )
     # Encoded in memory, since on a full disk imageio would fail again in its finalizer,
     # and Python would print that error with a traceback.
-    encoded = imageio.v3.imwrite("<bytes>", pixels, extension=".png")
+    png_bytes = imageio.v3.imwrite("<bytes>", pixels, extension=".png")
     with replaced_file(path) as partial:
-        partial.write_bytes(encoded)
+        partial.write_bytes(png_bytes)
 
 
 def _unreadable(path, error):

@@ -28,8 +28,8 @@ from nerfies_jax.runtime import processes, stopping
 MAX_JSON_BYTES = 64 * 2**20
 
 # Incomplete files of this process, and folders that it has swept.
-_unfinished: set[pathlib.Path] = set()
-_swept: set[pathlib.Path] = set()
+_partial_paths: set[pathlib.Path] = set()
+_swept_folders: set[pathlib.Path] = set()
 
 _LEFT_BEHIND = re.compile(
     rf"\.(?P<name>.+)\.(?P<owner>{processes.PATTERN})"
@@ -193,7 +193,7 @@ def replaced_file(path: AnyPath):
     finally:
         with contextlib.suppress(OSError):  # the disk may have become read-only
             partial.unlink(missing_ok=True)
-        _unfinished.discard(partial)
+        _partial_paths.discard(partial)
 
 
 def _sync_folder(folder):
@@ -208,12 +208,12 @@ def _sync_folder(folder):
 
 def _register(partial):
     """Register an incomplete file for removal if a signal ends the process."""
-    _unfinished.add(partial)
+    _partial_paths.add(partial)
     stopping.at_end(_remove_unfinished)
 
 
 def _remove_unfinished():
-    for path in list(_unfinished):
+    for path in list(_partial_paths):
         _remove(path)
 
 
@@ -228,8 +228,8 @@ def _remove(path):
 def _sweep_once(folder):
     """Sweep a folder before this process writes its first file there."""
     folder = folder.absolute()
-    if folder not in _swept:
-        _swept.add(folder)
+    if folder not in _swept_folders:
+        _swept_folders.add(folder)
         sweep(folder)
 
 
@@ -245,11 +245,11 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
     Returns:
       The hidden paths that were removed or renamed.
     """
-    handled: list[pathlib.Path] = []
+    cleaned_paths: list[pathlib.Path] = []
     try:
         paths = sorted(pathlib.Path(folder).glob(".*"))
     except OSError:
-        return handled
+        return cleaned_paths
     for path in paths:
         match = _LEFT_BEHIND.fullmatch(path.name)
         if match is None or not processes.has_ended(match["owner"]):
@@ -259,8 +259,8 @@ def sweep(folder: AnyPath) -> list[pathlib.Path]:
                 os.replace(path, path.parent / match["name"])
         else:
             _remove(path)
-        handled.append(path)
-    return handled
+        cleaned_paths.append(path)
+    return cleaned_paths
 
 
 @contextlib.contextmanager
@@ -468,4 +468,4 @@ def _partial_folder(path, parent):
         ) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        _unfinished.discard(partial)
+        _partial_paths.discard(partial)

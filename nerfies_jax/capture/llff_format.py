@@ -72,10 +72,10 @@ def read(
     )
     # In lexicographic order, as in LLFF's script.
     files = frames.images_in(available[source])
-    loaded = frames.read_frames(files, shrink_by, orientation="stored")
-    images = loaded.images
-    valid, notes = without_black_borders(images, loaded.valid())
-    notes += loaded.notes
+    sequence = frames.read_frames(files, shrink_by, orientation="stored")
+    images = sequence.images
+    valid, notes = without_black_borders(images, sequence.valid())
+    notes += sequence.notes
     placement = placed(poses)
     cameras = cameras_of(poses, placement, (images.shape[2], images.shape[1]))
     names = tuple(file.stem for file in files)
@@ -123,10 +123,10 @@ def order_note(names: Sequence[str]) -> tuple[str, ...]:
     """
     if list(names) == sorted(names, key=frames.natural):
         return ()
-    listed = ", ".join(names[:3])
+    listing = ", ".join(names[:3])
     return (
         f"the rows of {POSES} are assumed to be in the lexicographic order of the "
-        f"names ({listed}, ...): if they are in the order of the numbers, rename the "
+        f"names ({listing}, ...): if they are in the order of the numbers, rename the "
         "files with leading zeros",
     )
 

@@ -89,14 +89,16 @@ def find_encoding(paths: Sequence[AnyPath], orientation: str = "refuse") -> Enco
       CaptureError: If the masks are ambiguous, with the name of a file.
     """
     with ThreadPoolExecutor(4) as pool:
-        survey = safe_files.carried(_survey)
+        run_survey = safe_files.carried(_survey)
         files = map(pathlib.Path, paths)
-        surveys = list(pool.map(lambda file: survey(file, orientation), files))
-    transparent = [one for one in surveys if one.has_alpha and not one.opaque]
+        surveys = list(pool.map(lambda file: run_survey(file, orientation), files))
+    transparent = [
+        survey for survey in surveys if survey.has_alpha and not survey.opaque
+    ]
     if transparent:
         return _alpha_encoding(surveys)
-    deepest = max(one.full for one in surveys)
-    other = next((one for one in surveys if one.full != deepest), None)
+    deepest = max(survey.full for survey in surveys)
+    other = next((survey for survey in surveys if survey.full != deepest), None)
     if other is not None:
         raise CaptureError(
             f"{other.path}: a mask of {_bits(other.full)} bits among masks of "
@@ -135,10 +137,10 @@ def describe(
             "around, else leave them out"
         )
     count = f"{len(files)}" if len(files) == frames else f"{len(files)} of {frames}"
-    marked = f"{1 - white:.1%} of their pixels are black: {black}"
+    share_text = f"{1 - white:.1%} of their pixels are black: {black}"
     if white == 1:
-        marked = f"no pixel is black, so none is {black}"
-    return f"{count} masks of {encoding.text}; {marked}"
+        share_text = f"no pixel is black, so none is {black}"
+    return f"{count} masks of {encoding.text}; {share_text}"
 
 
 def _bits(full):
@@ -146,30 +148,30 @@ def _bits(full):
 
 
 def _alpha_encoding(surveys):
-    for one in surveys:
-        if not one.has_alpha:
+    for survey in surveys:
+        if not survey.has_alpha:
             raise CaptureError(
-                f"{one.path}: a mask without alpha channel among masks with one; "
+                f"{survey.path}: a mask without alpha channel among masks with one; "
                 f"{ADVICE}"
             )
-        if not one.cut_out:
+        if not survey.cut_out:
             raise CaptureError(
-                f"{one.path}: a mask with an alpha channel and black in its color, and "
-                f"either could be the mask; {ADVICE}"
+                f"{survey.path}: a mask with an alpha channel and black in its color, "
+                f"and either could be the mask; {ADVICE}"
             )
     return Encoding(True, 0, "alpha, opaque is taken as white")
 
 
 def _value_encoding(surveys):
-    counts = np.sum([one.counts for one in surveys], axis=0)
+    counts = np.sum([survey.counts for survey in surveys], axis=0)
     values = np.flatnonzero(counts)
     least, most = int(values[0]), int(values[-1])
-    colorful = any(one.colorful for one in surveys)
+    colorful = any(survey.colorful for survey in surveys)
     # 16-bit files often hold values of 8 bits.
     scale = 255 if most <= 255 else surveys[0].full
     half = (scale + 1) // 2
     first = surveys[0].path
-    listed = ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
+    listing = ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
     if colorful and least > 0:
         raise CaptureError(
             f"{first}: a mask in color without any black, so the marked pixels are "
@@ -182,23 +184,23 @@ def _value_encoding(surveys):
         return Encoding(
             False, most, text if most == surveys[0].full else f"{text} (white)"
         )
-    few = len(values) <= FEW
+    is_few = len(values) <= FEW
     labels = least == 0 and len(values) <= MOST_LABELS
-    if labels and (colorful or most < half or (few and most < 0.9 * scale)):
-        return Encoding(False, 1, f"labels {listed}; all but 0 are taken as white")
-    for one in surveys:
-        present = np.flatnonzero(one.counts)
-        lossy = one.path.suffix.lower() in LOSSY
+    if labels and (colorful or most < half or (is_few and most < 0.9 * scale)):
+        return Encoding(False, 1, f"labels {listing}; all but 0 are taken as white")
+    for survey in surveys:
+        present = np.flatnonzero(survey.counts)
+        lossy = survey.path.suffix.lower() in LOSSY
         if len(present) == 2 and present[0] == 0 and present[1] < half and not lossy:
             raise CaptureError(
-                f"{one.path}: a mask of 0 and {present[1]} among masks up to {most}; "
-                f"{ADVICE}"
+                f"{survey.path}: a mask of 0 and {present[1]} among masks up to "
+                f"{most}; {ADVICE}"
             )
     low = values[(values > 0) & (values < FEW)]
-    void = few and counts[low].sum() > 1e-3 * counts.sum()
+    void = is_few and counts[low].sum() > 1e-3 * counts.sum()
     if colorful or void or not least < half <= most:
         raise CaptureError(
-            f"{first}: masks of values {listed}, up to {most}, that are neither black "
+            f"{first}: masks of values {listing}, up to {most}, that are neither black "
             f"and white nor 0 and labels; {ADVICE}"
         )
     return Encoding(False, half, f"gray values, white from {half} on")

@@ -142,9 +142,9 @@ def _are_synchronized(groups, times):
     for group, time in zip(groups, times, strict=True):
         members[group].add(time)
     counts = collections.Counter(time for group in members.values() for time in group)
-    shared = {time for time, count in counts.items() if count > 1}
-    return len(shared) > 1 and all(
-        len(group & shared) >= _SHARED * len(group) for group in members.values()
+    shared_times = {time for time, count in counts.items() if count > 1}
+    return len(shared_times) > 1 and all(
+        len(group & shared_times) >= _SHARED * len(group) for group in members.values()
     )
 
 
@@ -161,7 +161,7 @@ def _overlap(groups, times):
     # In the order of start times, a camera overlaps an earlier one or none.
     last = None
     alone = set(spans)
-    for group, (first, end) in sorted(spans.items(), key=lambda one: one[1]):
+    for group, (first, end) in sorted(spans.items(), key=lambda item: item[1]):
         if last is not None and first <= spans[last][1]:
             alone -= {group, last}
         if last is None or end > spans[last][1]:
@@ -181,9 +181,9 @@ def _microseconds(name):
         )
     except ValueError:
         return None
-    elapsed = date - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    since_epoch = date - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
     part = (fraction or digits or "0")[:6].ljust(6, "0")
-    return elapsed // datetime.timedelta(microseconds=1) + int(part)
+    return since_epoch // datetime.timedelta(microseconds=1) + int(part)
 
 
 def _is_counter(names, dates):

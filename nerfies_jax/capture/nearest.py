@@ -17,6 +17,6 @@ def known_names(name: str, known: Iterable[str]) -> str:
       Text such as "did you mean X? there are X, Y, Z".
     """
     known = list(known)
-    listed = f"there are {', '.join(known)}" if known else "there are none"
+    listing = f"there are {', '.join(known)}" if known else "there are none"
     similar = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {similar[0]}? {listed}" if similar else listed
+    return f"did you mean {similar[0]}? {listing}" if similar else listing

@@ -47,10 +47,10 @@ def points_beside(
         if colmap.name_of(name) in row_of
     ]
     scene, rows = views.scene, np.array(pairs, int).reshape(-1, 2)
-    expected = views.cameras.position[rows[:, 1]].astype(np.float64)
+    expected_centers = views.cameras.position[rows[:, 1]].astype(np.float64)
     centers = (model.positions[rows[:, 0]] - np.array(scene.center)) * scene.scale
-    distance = np.linalg.norm(centers - expected, axis=1)
-    spread = np.linalg.norm(np.ptp(expected, axis=0))
+    distance = np.linalg.norm(centers - expected_centers, axis=1)
+    spread = np.linalg.norm(np.ptp(expected_centers, axis=0))
     if not len(rows) or distance.max() > SAME_PLACE * spread:
         note = f"{folders[0]} has other cameras: its points are not used"
         return None, (note,)

@@ -66,24 +66,24 @@ def read(
     paths = [frames.find_image(folder, name) for name in views.ids]
     rows, skip_notes = frames.keep_found(paths, views.ids, missing, str(folder))
     views = only(views, rows)
-    loaded = frames.read_frames([paths[row] for row in rows], shrink_by)
-    images, alpha = loaded.images, loaded.alpha
+    sequence = frames.read_frames([paths[row] for row in rows], shrink_by)
+    images, alpha = sequence.images, sequence.alpha
     total = source * shrink_by
     _check_image_size(paths[rows[0]], views.size, source)
     cameras = camera.resize(views.cameras, (total, total), (1, 1))
     size = (images.shape[2], images.shape[1])
-    valid, more = _masks(path / "valid", views.ids, size, total, "not observed")
-    static, masked = _masks(path / "resized_mask", views.ids, size, total, "moving")
-    notes += [*more, *masked]
+    valid, valid_notes = _masks(path / "valid", views.ids, size, total, "not observed")
+    static, mask_notes = _masks(path / "resized_mask", views.ids, size, total, "moving")
+    notes += [*valid_notes, *mask_notes]
     if alpha is not None:  # in DyCheck, 255 marks observed pixels
         valid = (alpha == 255) & (True if valid is None else valid == 1)
         notes.append("images have alpha: pixels below 255 count as not observed")
     elif valid is not None:
         valid = valid == 1
-    valid = frames.both(valid, loaded.observed)
-    notes += loaded.notes
+    valid = frames.both(valid, sequence.observed)
+    notes += sequence.notes
     moving = None if static is None else static < 1
-    points, more = _points(path, images, cameras, views, moving)
+    points, point_notes = _points(path, images, cameras, views, moving)
     depths, unread = _depths(path, views, size, total)
     return Capture(
         name=path.resolve().name,
@@ -110,7 +110,7 @@ def read(
         up=world_points.unit(views.extra.up) or world_points.up_direction(cameras),
         frames_per_second=views.extra.fps,
         path=path,
-        notes=(*views.notes, *notes, *skip_notes, *more, *unread),
+        notes=(*views.notes, *notes, *skip_notes, *point_notes, *unread),
     )
 
 
@@ -232,8 +232,8 @@ def _write_images(capture, folder, factor):
             static = ~blocks(moving[row], factor).any((-3, -1))
             image_files.write_png(subfolder("resized_mask") / f"{name}.png.png", static)
         if valid is not None:
-            observed = blocks(valid[row], factor).all((-3, -1))
-            image_files.write_png(subfolder("valid") / f"{name}.png", observed)
+            is_valid = blocks(valid[row], factor).all((-3, -1))
+            image_files.write_png(subfolder("valid") / f"{name}.png", is_valid)
         if depths is not None:
             depth = shrink_depth(depths[row], factor) / np.float32(capture.scale)
             np.save(subfolder("depth") / f"{name}.npy", depth, allow_pickle=False)

@@ -132,14 +132,14 @@ def read_cameras(
         )
     extra_file = path / "extra.json"
     extra = read_json(extra_file, ExtraFile) if extra_file.exists() else ExtraFile()
-    train, scored, notes = _splits(path, heldout)
-    names = sorted(set(train) | set(scored), key=frames.natural)
+    train, heldout_ids, notes = _splits(path, heldout)
+    names = sorted(set(train) | set(heldout_ids), key=frames.natural)
     ids, skip_notes = _with_camera_files(path, names, missing)
     files = [_camera_file(path, name) for name in ids]
     size = _common_size(path, ids, files)
     cameras = cameras_of(files, scene.scale, scene.center)
     check_cameras(cameras, ids, size, str(path / "camera"))
-    entries, more = _frame_entries(path, ids)
+    entries, entry_notes = _frame_entries(path, ids)
     row = {name: number for number, name in enumerate(ids)}
     return NerfiesViews(
         ids=ids,
@@ -147,13 +147,13 @@ def read_cameras(
         size=size,
         times=_times(entries, path, ids),
         train=np.sort([row[name] for name in train if name in row]).astype(int),
-        heldout=np.sort([row[name] for name in scored if name in row]).astype(int),
+        heldout=np.sort([row[name] for name in heldout_ids if name in row]).astype(int),
         warp_ids=splits.dense([_number(e.warp_id) for e in entries]),
         appearance_ids=splits.dense([_number(e.appearance_id) for e in entries]),
         camera_ids=splits.dense([e.camera_id for e in entries]),
         scene=scene,
         extra=extra,
-        notes=(*notes, *skip_notes, *more, *_unread(path, ids)),
+        notes=(*notes, *skip_notes, *entry_notes, *_unread(path, ids)),
     )
 
 
@@ -202,18 +202,22 @@ def _splits(path, heldout):
     if not all_names:
         raise CaptureError(f"{file}: no frames; list them under ids or train_ids")
     if heldout == "interp":
-        ordered = sorted(ids or all_names, key=frames.natural)
-        return ordered[::4], ordered[2::4], notes
+        sorted_ids = sorted(ids or all_names, key=frames.natural)
+        return sorted_ids[::4], sorted_ids[2::4], notes
     if isinstance(heldout, str):
         return *_named_split(path, heldout), notes
     if isinstance(heldout, int) or not val:
         step = splits.HELD_OUT if heldout is None else heldout
         pool = all_names if isinstance(heldout, int) or not train else train
         pool = sorted(pool, key=frames.natural)
-        training, scored = splits.hold_out_every(len(pool), step, str(path))
+        train_rows, heldout_rows = splits.hold_out_every(len(pool), step, str(path))
         if heldout is None:
-            notes += (f"no validation ids: {splits.held_out_note(scored, step)}",)
-        return [pool[row] for row in training], [pool[row] for row in scored], notes
+            notes += (f"no validation ids: {splits.held_out_note(heldout_rows, step)}",)
+        return (
+            [pool[row] for row in train_rows],
+            [pool[row] for row in heldout_rows],
+            notes,
+        )
     left_out = len(all_names) - len({*train, *val})
     if train and left_out:
         notes += (f"{left_out} frames in neither split are not read",)
@@ -240,16 +244,16 @@ def _with_camera_files(path, names, missing):
     absent = [name for name in names if name not in set(present)]
     if not absent:
         return present, ()
-    listed = ", ".join(f"camera/{name}.json" for name in absent[:5])
-    listed += ", ..." if len(absent) > 5 else ""
+    listing = ", ".join(f"camera/{name}.json" for name in absent[:5])
+    listing += ", ..." if len(absent) > 5 else ""
     if missing == "refuse" or not present:
         raise CaptureError(
             f"{path / 'dataset.json'}: {len(absent)} of {len(names)} frames have no "
-            f"camera file ({listed}); restore those files, or leave the frames out "
+            f"camera file ({listing}); restore those files, or leave the frames out "
             'with missing="skip"'
         )
     return present, (
-        f"{len(absent)} frames left out, they have no camera file: {listed}",
+        f"{len(absent)} frames left out, they have no camera file: {listing}",
     )
 
 
@@ -377,9 +381,9 @@ def _frame_entries(path, ids):
                     f"{MAX_ID - 1}"
                 )
     entries, notes = _complete_warp_ids(entries, file, ids)
-    interpolated = sum(isinstance(entry.warp_id, tuple) for entry in entries)
-    if interpolated:
-        notes += (f"{interpolated} frames have interpolated warp ids (HyperNeRF)",)
+    interpolations = sum(isinstance(entry.warp_id, tuple) for entry in entries)
+    if interpolations:
+        notes += (f"{interpolations} frames have interpolated warp ids (HyperNeRF)",)
     return entries, notes
 
 

@@ -71,14 +71,14 @@ def header(path: str) -> Iterator[tuple[dict[str, Any], dict]]:
     """
     session = _session(path)
 
-    def described(nodes):
+    def describe(nodes):
         return [(node.name, node.type, [*node.shape]) for node in nodes]
 
     metadata = session.get_modelmeta().custom_metadata_map
     yield (
         {
-            "inputs": described(session.get_inputs()),
-            "outputs": described(session.get_outputs()),
+            "inputs": describe(session.get_inputs()),
+            "outputs": describe(session.get_outputs()),
             "metadata": {**metadata},
         },
         {},
@@ -108,8 +108,8 @@ def run(
             image = image[..., ::-1]
         value: Any = np.asarray(image)
         if kind != "tensor(uint8)":
-            scaled = value * np.float64(settings["scale"])
-            value = (scaled - np.array(settings["mean"])) / np.array(settings["std"])
+            pixels = value * np.float64(settings["scale"])
+            value = (pixels - np.array(settings["mean"])) / np.array(settings["std"])
         value = value if channels_last else np.moveaxis(value, -1, 0)
         tensor = np.ascontiguousarray(value[None], TYPES[kind])
         (output,) = session.run([name], {entry: tensor})

@@ -128,13 +128,13 @@ def _rows_of(poses, heldout, train, where):
     count = len(poses)
     if heldout is not None:
         heldout_rows = _range(heldout, count, "heldout")
-        others = np.setdiff1d(np.arange(count), heldout_rows)
-        train_rows = others if train is None else _range(train, count, "train")
-        shared = np.intersect1d(train_rows, heldout_rows)
-        if shared.size:
+        other_rows = np.setdiff1d(np.arange(count), heldout_rows)
+        train_rows = other_rows if train is None else _range(train, count, "train")
+        shared_rows = np.intersect1d(train_rows, heldout_rows)
+        if shared_rows.size:
             raise ValueError(
-                f"train={train} and heldout={heldout} share row {shared[0]}; held-out "
-                "frames must not be trained on"
+                f"train={train} and heldout={heldout} share row {shared_rows[0]}; "
+                "held-out frames must not be trained on"
             )
         return train_rows, heldout_rows, "rows as specified"
     if train is not None:
@@ -154,10 +154,10 @@ def _rows_of(poses, heldout, train, where):
 def _longest_static_run(poses):
     """Length and start of the longest run of rows that share one pose."""
     count = len(poses)
-    same = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
+    is_static = np.abs(np.diff(poses, axis=0)).max((1, 2)) < SAME_POSE
     best, first = (0, 0), 0
     for row in range(1, count + 1):
-        if row == count or not same[row - 1]:
+        if row == count or not is_static[row - 1]:
             best = max(best, (row - first, -first))
             first = row
     return best[0], -best[1]

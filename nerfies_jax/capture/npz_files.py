@@ -153,8 +153,8 @@ def load_arrays(
     """
     try:
         with archive(path) as zip_file:
-            selected = [n for n in zip_file.names if names is None or n in names]
-            arrays = {name: zip_file.read(name) for name in selected}
+            members = [n for n in zip_file.names if names is None or n in names]
+            arrays = {name: zip_file.read(name) for name in members}
     except safe_files.CaptureError:
         raise
     except ValueError as error:

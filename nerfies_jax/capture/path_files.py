@@ -289,10 +289,10 @@ def write_nerfstudio(
     write_json(path, table)
 
 
-def _pose_and_fov(one, height):
+def _pose_and_fov(view, height):
     """The row-major OpenGL pose, and the vertical field of view in degrees."""
-    focal = float(one.focal_px) * float(one.pixel_aspect)
-    pose = opengl_pose(one.camera_from_world, one.position).ravel().tolist()
+    focal = float(view.focal_px) * float(view.pixel_aspect)
+    pose = opengl_pose(view.camera_from_world, view.position).ravel().tolist()
     return pose, math.degrees(2 * math.atan2(height, 2 * focal))
 
 
@@ -314,8 +314,8 @@ def write_nerfies(
     """
     with replaced_folder(path, overwrite) as folder:
         for row in range(len(planned.cameras.focal_px)):
-            one = camera.take(planned.cameras, row)
-            entry = camera_entry(one, capture, planned.size)
+            view = camera.take(planned.cameras, row)
+            entry = camera_entry(view, capture, planned.size)
             if planned.times is not None:
                 entry["time"] = float(planned.times[row])
             write_json(folder / f"{row:06d}.json", entry)

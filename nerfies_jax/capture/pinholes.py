@@ -54,13 +54,11 @@ def as_pinholes(capture: Capture) -> Capture:
         arrays = _undistort(capture, wide)
         if arrays["images"].nbytes <= MOST_KEPT_BYTES:
             _last.keep(capture, arrays)
-    observed = arrays["valid"]
-    note = (
-        f"images undistorted; {1 - observed.mean():.1%} of their pixels are unobserved"
-    )
+    valid = arrays["valid"]
+    note = f"images undistorted; {1 - valid.mean():.1%} of their pixels are unobserved"
     return dataclasses.replace(
         capture,
-        **arrays | {"valid": None if observed.all() else observed},
+        **arrays | {"valid": None if valid.all() else valid},
         cameras=cameras.crop(pinhole(capture.cameras), -wide.left, -wide.top),
         flow=None,
         external=None if capture.external is None else _last.external(capture, wide),
@@ -87,8 +85,8 @@ class _Last:
 
     def arrays(self, capture):
         others = _others(capture)
-        same = self._images() is capture.images and len(others) == len(self._others)
-        if same and all(a is b for a, b in zip(others, self._others, strict=True)):
+        is_same = self._images() is capture.images and len(others) == len(self._others)
+        if is_same and all(a is b for a, b in zip(others, self._others, strict=True)):
             return self._arrays
         return None
 
@@ -101,8 +99,8 @@ class _Last:
         if self.arrays(capture) is None:  # too large to be kept
             return _undistort_external(capture, capture.external, wide)
         if self._external[0] is not capture.external:
-            undistorted = _undistort_external(capture, capture.external, wide)
-            self._external = capture.external, undistorted
+            external = _undistort_external(capture, capture.external, wide)
+            self._external = capture.external, external
         return self._external[1]
 
 
@@ -118,7 +116,7 @@ def _undistort(capture, wide):
     """Images, masks and depths by name, with booleans of the observed pixels."""
     shape = (len(capture.images), *wide.size[::-1])
     images = frame_memory.allocate((*shape, 3), capture.images.dtype)
-    observed = frame_memory.allocate(shape, np.bool_)
+    valid = frame_memory.allocate(shape, np.bool_)
     masks: dict[str, Any] = {
         name: None if array is None else frame_memory.allocate(shape, array.dtype)
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
@@ -133,15 +131,15 @@ def _undistort(capture, wide):
             place, inside = maps.of(cameras.take(capture.cameras, row))
             images[row] = resampling.lanczos(capture.images[row], place)
             images[row][~inside] = 0
-            observed[row] = inside
+            valid[row] = inside
             if capture.valid is not None:
-                observed[row] &= resampling.nearest(capture.valid[row], place)
+                valid[row] &= resampling.nearest(capture.valid[row], place)
             for name, array in masks.items():
                 if array is not None:
                     source = getattr(capture, name)[row]
                     array[row] = np.where(inside, resampling.nearest(source, place), 0)
             stage.advance()
-    return {"images": images, "valid": observed, **masks}
+    return {"images": images, "valid": valid, **masks}
 
 
 def _undistort_external(capture, external, wide):
@@ -329,9 +327,9 @@ def _source_pixels(camera, size, wide):
     Where the lens model folds back there is no pixel at all.
     """
     straight = cameras.crop(pinhole(camera), -wide.left, -wide.top)
-    distorted, single = _distort(_float32(camera), _slopes(straight, wide.size))
-    distorted = np.where(np.asarray(single)[:, None], np.asarray(distorted), np.nan)
-    return resampling.array_places(_pixels(camera, distorted, wide.size), size)
+    positions, single = _distort(_float32(camera), _slopes(straight, wide.size))
+    positions = np.where(np.asarray(single)[:, None], np.asarray(positions), np.nan)
+    return resampling.array_places(_pixels(camera, positions, wide.size), size)
 
 
 def _float32(camera):
@@ -339,16 +337,16 @@ def _float32(camera):
 
 
 @jax.jit
-def _straight(camera, distorted):
-    """Slopes of the rays that the lens bends to these, and whether there are any."""
-    return jax.vmap(lens.undistort, (None, 0))(camera, distorted)
+def _straight(camera, positions):
+    """Undistorted slopes of distorted positions, and booleans where they exist."""
+    return jax.vmap(lens.undistort, (None, 0))(camera, positions)
 
 
 @jax.jit
 def _distort(camera, slopes):
     """Distorted image-plane positions, and booleans where the lens is one-to-one."""
-    distorted = jax.vmap(lens.distort, (None, 0))(camera, slopes)
-    return distorted, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)
+    positions = jax.vmap(lens.distort, (None, 0))(camera, slopes)
+    return positions, jax.vmap(lens.one_to_one, (None, 0))(camera, slopes)
 
 
 def _slopes(camera, size):

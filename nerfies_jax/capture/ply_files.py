@@ -94,10 +94,10 @@ def check_header(head: bytes, size: int) -> bytes:
             "header of a point cloud"
         )
     header = head[: end.end()]
-    claimed = 0
+    claimed_bytes = 0
     for name, count, row_bytes in _elements(header):
-        claimed += count * max(row_bytes, 1)
-        if claimed > size:
+        claimed_bytes += count * max(row_bytes, 1)
+        if claimed_bytes > size:
             raise ValueError(f"its header claims {count} of {name} in {size} bytes")
     return header
 

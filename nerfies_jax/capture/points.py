@@ -50,8 +50,8 @@ def place_by_points(
     """
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     inliers = points[distance <= np.quantile(distance, INLIERS)]
-    enclosed = np.concatenate([inliers, positions])
-    low, high = enclosed.min(0), enclosed.max(0)
+    enclosed_points = np.concatenate([inliers, positions])
+    low, high = enclosed_points.min(0), enclosed_points.max(0)
     scale = 1 / np.linalg.norm(high - low)
     near, far = np.quantile(depths, QUANTILES) * scale
     return Placement(

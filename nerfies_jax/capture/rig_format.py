@@ -74,34 +74,34 @@ def read(
     )
     cameras = available[source]
     reader = _read_folders if cameras[0].is_dir() else _read_videos
-    recorded = reader(path, cameras, shrink_by)
+    recording = reader(path, cameras, shrink_by)
     names = [each.stem for each in cameras]
-    train, heldout_rows, note = _split(recorded, names, heldout, path)
+    train, heldout_rows, note = _split(recording, names, heldout, path)
     placement = llff_format.placed(poses)
-    size = recorded.images.shape[2:0:-1]
-    fixed = llff_format.cameras_of(poses, placement, size)
-    times = splits.spread(recorded.numbers)
+    size = recording.images.shape[2:0:-1]
+    rig_cameras = llff_format.cameras_of(poses, placement, size)
+    times = splits.spread(recording.numbers)
     return Capture(
         name=path.resolve().name,
         source="rig",
-        ids=recorded.names,
-        images=recorded.images,
-        cameras=camera.take(fixed, recorded.camera_ids),
+        ids=recording.names,
+        images=recording.images,
+        cameras=camera.take(rig_cameras, recording.camera_ids),
         times=times,
         train=train,
         heldout=heldout_rows,
         near=placement.near,
         far=placement.far,
-        warp_ids=splits.dense(recorded.numbers),
-        appearance_ids=recorded.camera_ids,
-        camera_ids=recorded.camera_ids,
-        valid=recorded.valid,
+        warp_ids=splits.dense(recording.numbers),
+        appearance_ids=recording.camera_ids,
+        camera_ids=recording.camera_ids,
+        valid=recording.valid,
         scale=placement.scale,
         center=placement.center,
-        up=world_points.up_direction(fixed),
-        frames_per_second=recorded.rate,
+        up=world_points.up_direction(rig_cameras),
+        frames_per_second=recording.rate,
         path=path,
-        notes=(*llff_format.order_note(names), *recorded.notes, note),
+        notes=(*llff_format.order_note(names), *recording.notes, note),
     )
 
 
@@ -166,22 +166,22 @@ def _read_folders(path, folders, shrink_by):
             "the names of the images give no times that cameras share: the n-th images "
             "of all cameras are assumed to have the same time",
         )
-    loaded = frames.read_frames(all_files, shrink_by, orientation="stored")
+    sequence = frames.read_frames(all_files, shrink_by, orientation="stored")
     return _Recorded(
-        images=loaded.images,
-        valid=loaded.valid(),
+        images=sequence.images,
+        valid=sequence.valid(),
         camera_ids=camera_ids.astype(np.int32),
         numbers=numbers,
         names=tuple(name.replace("/", "_") for name in names),
         rate=None,
-        notes=(*notes, *loaded.notes, *_lengths(folders, camera_ids)),
+        notes=(*notes, *sequence.notes, *_lengths(folders, camera_ids)),
     )
 
 
-def _same_groups(one, other):
+def _same_groups(first, second):
     """Test if two labelings define the same groups."""
-    pairs = set(zip(one.tolist(), other.tolist(), strict=True))
-    return len(pairs) == len(set(one.tolist())) == len(set(other.tolist()))
+    pairs = set(zip(first.tolist(), second.tolist(), strict=True))
+    return len(pairs) == len(set(first.tolist())) == len(set(second.tolist()))
 
 
 def _read_videos(path, files, shrink_by):
@@ -197,9 +197,9 @@ def _read_videos(path, files, shrink_by):
             first = len(seconds)
             for time, frame in video.read_video(file, damaged="skip"):
                 if len(seconds) == len(images):  # more frames than in the headers
-                    more = frames.allocated((2 * len(images), *images.shape[1:]), path)
-                    more[: len(images)] = images
-                    images = more
+                    array = frames.allocated((2 * len(images), *images.shape[1:]), path)
+                    array[: len(images)] = images
+                    images = array
                 images[len(seconds)] = _shrink(file, frame, shrink_by, (width, height))
                 seconds.append(time)
                 camera_ids.append(number)
@@ -262,11 +262,11 @@ def _lengths(cameras, camera_ids):
     )
 
 
-def _split(recorded, names, heldout, path):
+def _split(recording, names, heldout, path):
     """Training rows, held-out rows and a note."""
     if isinstance(heldout, int):
         train, heldout_rows = splits.hold_out_in_time(
-            recorded.numbers, recorded.camera_ids, heldout, str(path)
+            recording.numbers, recording.camera_ids, heldout, str(path)
         )
         return train, heldout_rows, splits.held_out_note(heldout_rows, heldout)
     test = names[0] if heldout is None else heldout
@@ -275,6 +275,6 @@ def _split(recorded, names, heldout, path):
             f"{path}: no camera {test!r} to hold out; there are {', '.join(names)}, "
             "or a number n holds out every n-th frame"
         )
-    is_heldout = recorded.camera_ids == names.index(test)
+    is_heldout = recording.camera_ids == names.index(test)
     note = f"camera {test} is held out, {len(names) - 1} cameras are for training"
     return np.flatnonzero(~is_heldout), np.flatnonzero(is_heldout), note

@@ -176,8 +176,10 @@ def notes(
     lines = []
     others = [other for other in tried if other.rung != result.rung]
     if others:
-        listed = "; ".join(f"{o.rung.text}: {_briefly(o)}" for o in others)
-        lines.append(f"camera model: {result.rung.text} ({_briefly(result)}), {listed}")
+        listing = "; ".join(f"{o.rung.text}: {_briefly(o)}" for o in others)
+        lines.append(
+            f"camera model: {result.rung.text} ({_briefly(result)}), {listing}"
+        )
     lens = implausible_lens(result)
     if lens:
         lines.append(f"doubtful: {' and '.join(lens)}, so shapes may be distorted")
@@ -196,8 +198,8 @@ def notes(
             "without zooming"
         )
     if len(pieces) > 1:
-        listed = ", ".join(map(str, pieces[1:6]))
-        lines.append(f"pieces of {listed} images did not fit and are left out")
+        listing = ", ".join(map(str, pieces[1:6]))
+        lines.append(f"pieces of {listing} images did not fit and are left out")
     return lines
 
 
@@ -222,12 +224,12 @@ def _better(new: Summary, old: Summary) -> bool:
     return new.points > old.points
 
 
-def _is_zoom(each, shared):
-    low, high = each.focal
+def _is_zoom(per_image, common):
+    low, high = per_image.focal
     spread = high / low - 1 if low > 0 else math.inf
-    lower = each.error_px < ZOOM_ERROR * shared.error_px
-    more = each.placed > shared.placed + SAME_PLACED * shared.images
-    return spread > ZOOM_SPREAD and (lower or more)
+    lower_error = per_image.error_px < ZOOM_ERROR * common.error_px
+    more_images = per_image.placed > common.placed + SAME_PLACED * common.images
+    return spread > ZOOM_SPREAD and (lower_error or more_images)
 
 
 def folds_inside(distortion: Sequence[float], corner: float) -> bool:
@@ -244,7 +246,7 @@ def folds_inside(distortion: Sequence[float], corner: float) -> bool:
     # Beyond 80 degrees off the axis a perspective model ends in any case.
     radius = np.linspace(0, max(2 * corner, math.tan(math.radians(80))), 4000)
     factor = 1 + sum(k * radius ** (2 * n + 2) for n, k in enumerate(distortion))
-    observed = radius * factor
-    falls = np.flatnonzero(np.diff(observed) <= 0)
-    reached = observed[falls[0]] if falls.size else observed[-1]
-    return bool(reached < corner)
+    distorted_radius = radius * factor
+    falls = np.flatnonzero(np.diff(distorted_radius) <= 0)
+    max_radius = distorted_radius[falls[0]] if falls.size else distorted_radius[-1]
+    return bool(max_radius < corner)

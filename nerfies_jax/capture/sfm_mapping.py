@@ -135,12 +135,12 @@ def _refine(model, options):
     A step that makes the intrinsics implausible is undone.
     """
     for distortion in (False, True):
-        refined = copy.deepcopy(model)
-        sfm_joining.adjust(refined, options, distortion)
-        lens = _summarize(refined, sfm_ladder.HELD, refined.num_reg_images())
+        candidate = copy.deepcopy(model)
+        sfm_joining.adjust(candidate, options, distortion)
+        lens = _summarize(candidate, sfm_ladder.HELD, candidate.num_reg_images())
         if sfm_ladder.implausible_lens(lens):
             break
-        model = refined
+        model = candidate
     return model
 
 
@@ -148,8 +148,8 @@ def _summarize(model, rung: Rung, images: int) -> Summary:
     """Measure the quality of a reconstruction and of its intrinsics."""
     if model is None:
         return Summary(rung, images, 0, 0, 0.0, 0.0, (1.0, 1.0), 1.0, folds=False)
-    used = {model.image(number).camera_id for number in model.reg_image_ids()}
-    lenses = [_lens(model.camera(number)) for number in sorted(used)]
+    camera_ids = {model.image(number).camera_id for number in model.reg_image_ids()}
+    lenses = [_lens(model.camera(number)) for number in sorted(camera_ids)]
     focals = [focal for focal, _, _ in lenses]
     points, error_px, angle_deg = _quality(model)
     return Summary(
@@ -194,16 +194,16 @@ def _focal_spread(model):
     ratios = []
     for number in numbers[:: -(-len(numbers) // MOST_FITTED)]:
         image = model.image(number)
-        observed = [point for point in image.points2D if point.has_point3D()]
-        if len(observed) < LEAST_FITTED:
+        observations = [point for point in image.points2D if point.has_point3D()]
+        if len(observations) < LEAST_FITTED:
             continue
         camera = copy.deepcopy(model.camera(image.camera_id))
         before = camera.mean_focal_length()
         solution = pycolmap.refine_absolute_pose(
             image.cam_from_world(),
-            np.array([point.xy for point in observed]),
-            np.array([model.point3D(point.point3D_id).xyz for point in observed]),
-            np.ones(len(observed), bool),
+            np.array([point.xy for point in observations]),
+            np.array([model.point3D(point.point3D_id).xyz for point in observations]),
+            np.ones(len(observations), bool),
             camera,
             options,
         )

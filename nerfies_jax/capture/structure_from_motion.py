@@ -323,12 +323,12 @@ def _follow(lines, log, images):
                     stack.close()
                     current = name
                     stage = stack.enter_context(events.stage(name))
-                done, total = (*map(int, match.groups()), images)[:2]
-                stage.reach(done, total)
+                count, total = (*map(int, match.groups()), images)[:2]
+                stage.reach(count, total)
 
 
 def _reconstruct(
-    folder: pathlib.Path, features: str | None, masked: bool, groups, spec
+    folder: pathlib.Path, features: str | None, has_masks: bool, groups, spec
 ):
     """Write folder/sparse/0 in the child process, and return fields of `Poses`."""
     threads = spec.threads or os.cpu_count() or 1
@@ -339,25 +339,25 @@ def _reconstruct(
         sfm_features.extract(partial, images, spec, threads)
         partial.replace(database)
     groups = [CameraGroup(tuple(names), focal) for names, focal in groups]
-    mapped = sfm_mapping.climb(
-        database, images, folder, groups, spec, folder / "masks" if masked else None
+    mapping = sfm_mapping.climb(
+        database, images, folder, groups, spec, folder / "masks" if has_masks else None
     )
     (folder / "features.db").unlink(missing_ok=True)
-    if mapped is None:
+    if mapping is None:
         return {"placed": 0, "points": 0, "error_px": 0.0, "angle_deg": 0.0}
     target = folder / "sparse" / "0"
     target.mkdir(parents=True)
-    mapped.model.write(str(target))
-    best = mapped.summary
+    mapping.model.write(str(target))
+    best = mapping.summary
     names = sorted(
-        mapped.model.image(number).name for number in mapped.model.reg_image_ids()
+        mapping.model.image(number).name for number in mapping.model.reg_image_ids()
     )
     return {
         "placed": best.placed,
         "points": best.points,
         "error_px": best.error_px,
         "angle_deg": best.angle_deg,
-        "notes": sfm_ladder.notes(best, mapped.tried, mapped.pieces),
+        "notes": sfm_ladder.notes(best, mapping.tried, mapping.pieces),
         "span": [names[0], names[-1]],
     }
 

@@ -141,10 +141,10 @@ def _key(name):
 def _listing(folder):
     """Names in a folder by their case-folded spelling. Empty if it is not a folder."""
     try:
-        changed = folder.stat().st_mtime_ns
-        if time.time_ns() - changed < _SETTLED_NS:
-            return _read_listing(str(folder), changed)
-        return _cached_listing(str(folder), changed)
+        mtime_ns = folder.stat().st_mtime_ns
+        if time.time_ns() - mtime_ns < _SETTLED_NS:
+            return _read_listing(str(folder), mtime_ns)
+        return _cached_listing(str(folder), mtime_ns)
     except OSError:
         return {}
 

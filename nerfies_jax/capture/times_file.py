@@ -41,16 +41,16 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
       CaptureError: The file cannot be read, or a frame has no time in it.
     """
     path = pathlib.Path(path)
-    by_name, listed = _read(path)
+    by_name, ordered_times = _read(path)
     names = sorted(capture.ids, key=frames.natural)
     notes: tuple[str, ...] = ()
-    if listed is not None:
-        if len(listed) != len(names):
+    if ordered_times is not None:
+        if len(ordered_times) != len(names):
             raise CaptureError(
-                f"{path}: {len(listed)} times for {len(names)} frames; write one for "
-                "each, in the order of their names, or add the names"
+                f"{path}: {len(ordered_times)} times for {len(names)} frames; write "
+                "one for each, in the order of their names, or add the names"
             )
-        table = dict(zip(names, listed, strict=True))
+        table = dict(zip(names, ordered_times, strict=True))
         values = [table[name] for name in capture.ids]
     else:
         values, notes = _by_name(capture, by_name, path)
@@ -61,17 +61,19 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
             f"{path}: frame {capture.ids[row]!r} has time {clock[row]:g}; every time "
             "must be a finite number"
         )
-    camera_ids, more = _cameras(capture, clock)
+    camera_ids, camera_notes = _cameras(capture, clock)
     first, last = clock.min(), clock.max()
     note = f"times from {path.name}: {first:.6g} to {last:.6g} are mapped to 0 to 1"
-    changed = not np.array_equal(camera_ids, capture.camera_ids)
+    is_regrouped = not np.array_equal(camera_ids, capture.camera_ids)
     return dataclasses.replace(
         capture,
         times=splits.spread(clock),
         warp_ids=splits.dense(clock),
         camera_ids=camera_ids,
-        flow=None if changed else capture.flow,  # flow is between frames of one camera
-        notes=(*capture.notes, note, *notes, *more),
+        flow=None
+        if is_regrouped
+        else capture.flow,  # flow is between frames of one camera
+        notes=(*capture.notes, note, *notes, *camera_notes),
     )
 
 
@@ -148,22 +150,26 @@ def _value(time, path):
     return value
 
 
-def _by_name(capture, named, path):
+def _by_name(capture, times, path):
     """The time of each frame, and a note on entries without a frame."""
-    table = {_plain(name): number for name, number in named.items()}
-    if len(table) < len(named):
+    table = {_plain(name): number for name, number in times.items()}
+    if len(table) < len(times):
         raise CaptureError(f"{path}: several names of one frame; keep one of each")
     find = _finder(table)
     keys = [find(name) for name in capture.ids]
     absent = [name for name, key in zip(capture.ids, keys, strict=True) if key is None]
     if absent:
-        listed = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
+        listing = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
         raise CaptureError(
-            f"{path}: no time for {len(absent)} of {len(keys)} frames ({listed}); add "
+            f"{path}: no time for {len(absent)} of {len(keys)} frames ({listing}); add "
             "them under these names, or under those of their images"
         )
-    unused = len(table) - len({*keys})
-    notes = (f"{unused} entries of {path.name} have no frame",) if unused else ()
+    unused_count = len(table) - len({*keys})
+    notes = (
+        (f"{unused_count} entries of {path.name} have no frame",)
+        if unused_count
+        else ()
+    )
     return [table[key] for key in keys], notes
 
 

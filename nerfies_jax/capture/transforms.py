@@ -119,29 +119,29 @@ def _with_poses(file, missing):
     """Read a file. Frames without a pose are refused, or left out with a note."""
     transforms = read_json(file, Transforms)
     frames.check_missing(missing, str(file))
-    posed = [each for each in transforms.frames if each.transform_matrix is not None]
-    unposed = [
+    entries = [each for each in transforms.frames if each.transform_matrix is not None]
+    absent = [
         each.file_path for each in transforms.frames if each.transform_matrix is None
     ]
-    if not unposed:
+    if not absent:
         return transforms, ()
-    listed = ", ".join(unposed[:5]) + (", ..." if len(unposed) > 5 else "")
-    if missing == "refuse" or not posed:
+    listing = ", ".join(absent[:5]) + (", ..." if len(absent) > 5 else "")
+    if missing == "refuse" or not entries:
         raise CaptureError(
-            f"{file}: {len(unposed)} of {len(transforms.frames)} frames have no "
-            f"transform_matrix ({listed}); add their poses, or leave those frames out "
+            f"{file}: {len(absent)} of {len(transforms.frames)} frames have no "
+            f"transform_matrix ({listing}); add their poses, or leave those frames out "
             'with missing="skip"'
         )
-    skipped = {text_files.forward_slashes(name) for name in unposed}
+    absent_paths = {text_files.forward_slashes(name) for name in absent}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = getattr(transforms, key)
         if names is not None:
             used_names = [
-                n for n in names if text_files.forward_slashes(n) not in skipped
+                n for n in names if text_files.forward_slashes(n) not in absent_paths
             ]
             setattr(transforms, key, used_names)
-    transforms.frames = posed
-    note = f"{len(unposed)} frames left out, they have no transform_matrix: {listed}"
+    transforms.frames = entries
+    note = f"{len(absent)} frames left out, they have no transform_matrix: {listing}"
     return transforms, (note,)
 
 
@@ -150,8 +150,8 @@ def _fill_times(file, entries):
 
     If no frame has a time, all stay without.
     """
-    untimed = [entry for entry in entries if entry.time is None]
-    if not untimed or len(untimed) == len(entries):
+    gaps = [entry for entry in entries if entry.time is None]
+    if not gaps or len(gaps) == len(entries):
         return ()
     folders = collections.defaultdict(list)
     for entry in entries:
@@ -159,19 +159,19 @@ def _fill_times(file, entries):
         folders[pathlib.PurePosixPath(path).parent].append(entry)
     for group in folders.values():
         _fill_folder(file, group)
-    return (f"{len(untimed)} frames have no time: interpolated between neighbors",)
+    return (f"{len(gaps)} frames have no time: interpolated between neighbors",)
 
 
 def _fill_folder(file, entries):
-    untimed = [entry for entry in entries if entry.time is None]
-    timed = [entry for entry in entries if entry.time is not None]
-    if not untimed:
+    gaps = [entry for entry in entries if entry.time is None]
+    anchors = [entry for entry in entries if entry.time is not None]
+    if not gaps:
         return
     clock = name_times.clock(stems(entries)).times
     name_time = dict(zip(map(id, entries), clock, strict=True))
-    knots, rows = np.unique([float(name_time[id(entry)]) for entry in timed], True)
-    times = np.array([timed[row].time for row in rows.tolist()], float)
-    for entry in untimed:
+    knots, rows = np.unique([float(name_time[id(entry)]) for entry in anchors], True)
+    times = np.array([anchors[row].time for row in rows.tolist()], float)
+    for entry in gaps:
         knot = name_time[id(entry)]
         time = -1.0
         if len(knots) > 1:
@@ -181,16 +181,16 @@ def _fill_folder(file, entries):
         if not -ROUNDING <= time <= 1 + ROUNDING:
             raise CaptureError(
                 f"{file}: frame {entry.file_path!r} has no time, and none can be "
-                f"derived from the {len(timed)} other frames of its folder; add it"
+                f"derived from the {len(anchors)} other frames of its folder; add it"
             )
         entry.time = min(max(time, 0.0), 1.0)
 
 
-def _fill_file(file, entries, others):
+def _fill_file(file, entries, other_entries):
     """Space times evenly over a split without any, as in D-NeRF, if the other has."""
     if not entries or entries[0].time is not None:
         return ()
-    if not others or others[0].time is None:
+    if not other_entries or other_entries[0].time is None:
         return ()
     for entry, time in zip(entries, np.linspace(0, 1, len(entries)), strict=True):
         entry.time = float(time)
@@ -246,15 +246,15 @@ def _split(file, transforms, heldout, missing):
                 if not second.frames:
                     empty += (f"{other.name} has no frames",)
                     continue
-                more = skip_notes + _fill_times(other, second.frames)
-                more += _fill_file(file, transforms.frames, second.frames)
-                more += _fill_file(other, second.frames, transforms.frames)
+                split_notes = skip_notes + _fill_times(other, second.frames)
+                split_notes += _fill_file(file, transforms.frames, second.frames)
+                split_notes += _fill_file(other, second.frames, transforms.frames)
                 return Split(
                     file,
                     transforms,
                     transforms.frames,
                     _with_intrinsics(second),
-                    (f"the {name} split is held out", *empty, *more),
+                    (f"the {name} split is held out", *empty, *split_notes),
                 )
     if isinstance(heldout, str):
         raise CaptureError(
@@ -272,14 +272,14 @@ def _split(file, transforms, heldout, missing):
         range(len(pool)),
         key=lambda row: (times[row], frames.natural(pool[row].file_path)),
     )
-    ordered = [pool[row] for row in order]
+    entries = [pool[row] for row in order]
     interval = splits.HELD_OUT if heldout is None else heldout
-    train_rows, heldout_rows = splits.hold_out_every(len(ordered), interval, str(file))
+    train_rows, heldout_rows = splits.hold_out_every(len(entries), interval, str(file))
     return Split(
         file,
         transforms,
-        [ordered[row] for row in train_rows],
-        [ordered[row] for row in heldout_rows],
+        [entries[row] for row in train_rows],
+        [entries[row] for row in heldout_rows],
         (f"no other split: {splits.held_out_note(heldout_rows, interval)}", *empty),
     )
 

@@ -62,10 +62,10 @@ def resolve(
         supported, or its size does not match the image.
     """
     distortion = _distortion(entry, transforms, label)
-    stated = _stated_size(entry) or _stated_size(transforms) or (None, None)
+    stated_size = _stated_size(entry) or _stated_size(transforms) or (None, None)
     width, height = (
         side if side is not None else image_side
-        for side, image_side in zip(stated, size, strict=True)
+        for side, image_side in zip(stated_size, size, strict=True)
     )
     if min(width, height) <= 0 or abs(size[0] * height / width - size[1]) > 1:
         raise CaptureError(
@@ -80,7 +80,7 @@ def resolve(
         center_size[1] / 2 if level.cy is None else level.cy,
     )
     times = 1
-    if stated == (None, None) and None not in (level.cx, level.cy):
+    if stated_size == (None, None) and None not in (level.cx, level.cy):
         times = _times_as_large(center, size, label)
     level = _level(entry, transforms, FOCAL)
     focal_size = _size_of(level, (width, height), size)
@@ -105,13 +105,13 @@ def _stated_size(level):
     return None if level.w is None and level.h is None else (level.w, level.h)
 
 
-def _size_of(level, resolved, size):
+def _size_of(level, default_size, size):
     """The image size that the intrinsics of a level refer to."""
     width, height = _stated_size(level) or (None, None)
     if width is None or height is None or width <= 0:
-        return resolved
+        return default_size
     same_shape = abs(size[0] * height / width - size[1]) <= 1
-    return (width, height) if same_shape else resolved
+    return (width, height) if same_shape else default_size
 
 
 def _times_as_large(center, size, label):
@@ -213,13 +213,17 @@ def notes(intrinsics: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...
       Notes.
     """
     lines: tuple[str, ...] = ()
-    sizes = {one.size for one in intrinsics if one.size != size and not one.larger}
+    sizes = {
+        camera.size
+        for camera in intrinsics
+        if camera.size != size and not camera.larger
+    }
     if sizes:
         width, height = min(sizes)
         lines += (
             f"cameras for {width:g}x{height:g} scaled to images of {size[0]}x{size[1]}",
         )
-    larger = {one.size for one in intrinsics if one.larger}
+    larger = {camera.size for camera in intrinsics if camera.larger}
     if larger:
         width, height = min(larger)
         lines += (

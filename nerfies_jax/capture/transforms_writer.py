@@ -125,8 +125,8 @@ def _transforms(capture, units):
     cameras = capture.cameras
     lenses = [_lens(cameras, row) for row in range(len(capture.ids))]
     same_lens = all(lens == lenses[0] for lens in lenses)
-    distorted = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
-    model = "OPENCV" if distorted else "PINHOLE"
+    is_distorted = np.any(cameras.radial != 0) or np.any(cameras.tangential != 0)
+    model = "OPENCV" if is_distorted else "PINHOLE"
     if cameras.fisheye is not None:
         model = "OPENCV_FISHEYE"
     table: dict[str, Any] = {

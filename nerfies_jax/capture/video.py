@@ -99,11 +99,15 @@ def _encode(av, partial, path, first, frames, frames_per_second, quality):
                     f"{path}: frame {number} is {frame.dtype} of shape {frame.shape}; "
                     f"expected uint8 of shape {first.shape}, as the first"
                 )
-            padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
-            encoded = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
+            even_frame = np.pad(
+                frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge"
+            )
+            video_frame = av.VideoFrame.from_ndarray(
+                even_frame, format="rgb24"
+            ).reformat(
                 format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG"
             )
-            container.mux(stream.encode(encoded))
+            container.mux(stream.encode(video_frame))
         container.mux(stream.encode())
 
 

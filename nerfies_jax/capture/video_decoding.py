@@ -41,8 +41,8 @@ def frames(
     """
     av = extras.library("av", "video")
     last = math.inf if rows is None else max(rows, default=-1)
-    requested = None if rows is None else set(rows)
-    emitted, size = 0, None
+    requested_rows = None if rows is None else set(rows)
+    count, size = 0, None
     with _words_of(av), av.open(path) as container:
         stream = _main_stream(container)
         _check_size(stream.width, stream.height)
@@ -56,19 +56,25 @@ def frames(
                     f"{frame.width}x{frame.height} pixels at frame {number}; cut the "
                     "video there"
                 )
-            if number % stride or not (requested is None or number in requested):
+            if number % stride or not (
+                requested_rows is None or number in requested_rows
+            ):
                 yield {}, {}
                 continue
-            if emitted >= most:
+            if count >= most:
                 return
-            emitted += 1
-            squared = _square(frame, aspect)
-            pixels = squared.to_ndarray(format="gray") if gray else _pixels(squared)
+            count += 1
+            square_frame = _square(frame, aspect)
+            pixels = (
+                square_frame.to_ndarray(format="gray")
+                if gray
+                else _pixels(square_frame)
+            )
             upright = _upright(pixels, frame)
             yield {"seconds": float(frame.time or 0.0)}, {"pixels": upright}
             if number >= last:
                 return
-    if not emitted:
+    if not count:
         raise FileError("holds no frames; copy or encode it again")
 
 

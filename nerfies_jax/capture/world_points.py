@@ -44,9 +44,9 @@ def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
 
 
 _project = jax.jit(
-    lambda one, points: (
-        *jax.vmap(camera.project, (None, 0))(one, points),
-        jax.vmap(camera.projectable, (None, 0))(one, points),
+    lambda view, points: (
+        *jax.vmap(camera.project, (None, 0))(view, points),
+        jax.vmap(camera.projectable, (None, 0))(view, points),
     )
 )
 
@@ -66,8 +66,8 @@ def pixels_of(
       Pixel positions [points, 2], z-depths [points], and booleans of the points inside
       the image [points].
     """
-    one = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), cameras)
-    pixel, depth, projectable = map(np.asarray, _project(one, jnp.asarray(position)))
+    view = jax.tree.map(lambda leaf: jnp.asarray(leaf[row]), cameras)
+    pixel, depth, projectable = map(np.asarray, _project(view, jnp.asarray(position)))
     inside = (pixel >= 0).all(-1) & (pixel < np.asarray(size)).all(-1)
     return pixel, depth, inside & projectable & (depth > 0)
 

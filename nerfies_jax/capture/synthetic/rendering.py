@@ -234,7 +234,7 @@ def recorded_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
     depth = spec.cameras.distance
     shift = is_first * depth * spec.pose_error.shift_px / focal_px * shift
 
-    perturbed = jax.jit(jax.vmap(cameras.move))(plan.cameras, rotation, shift)
+    noisy_cameras = jax.jit(jax.vmap(cameras.move))(plan.cameras, rotation, shift)
     return jax.tree.map(
         lambda true, new: np.where(
             is_first.reshape(-1, *(1,) * (true.ndim - 1)),
@@ -242,7 +242,7 @@ def recorded_cameras(spec: SceneSpec, plan: Schedule, seed: int) -> Camera:
             true,
         ),
         plan.cameras,
-        perturbed,
+        noisy_cameras,
     )
 
 
@@ -292,8 +292,8 @@ def _arc(spec, times, seed, is_second):
     up = np.array([0.0, 1.0, 0.0])
     rise = (setting.height + 0.2 * setting.height * np.cos(sweep))[:, None] * up
     if spec.rig is not None:
-        raised = np.array(spec.rig.turns(len(times))) % 2
-        rise = (setting.height + spec.rig.rise * raised)[:, None] * up
+        parity = np.array(spec.rig.turns(len(times))) % 2
+        rise = (setting.height + spec.rig.rise * parity)[:, None] * up
     position = setting.target + distance[:, None] * back + rise + shake[:, :3]
     if is_second:
         offset_right, offset_up, offset_back = setting.beside

@@ -273,13 +273,13 @@ class Sheet:
             ray = jax.lax.stop_gradient((origin, direction, time))
             return self.undeform(ray[0] + distance * ray[1], ray[2])[2]
 
-        low, high, bracketed = self._bracket(
+        low, high, has_root = self._bracket(
             *jax.lax.stop_gradient((origin, direction, time))
         )
         sign_low = jnp.sign(fixed_height(low))
 
-        def unfinished(state):
-            return bracketed & (state[0] < REFINEMENTS)
+        def is_unfinished(state):
+            return has_root & (state[0] < REFINEMENTS)
 
         def refine(state):
             index, low, high, at = state
@@ -291,14 +291,14 @@ class Sheet:
             return index + 1, low, high, jnp.where(inside, newton, (low + high) / 2)
 
         start = (jnp.int32(0), low, high, (low + high) / 2)
-        at = jax.lax.stop_gradient(jax.lax.while_loop(unfinished, refine, start)[3])
+        at = jax.lax.stop_gradient(jax.lax.while_loop(is_unfinished, refine, start)[3])
         # One Newton step outside of the loop has the implicit derivative of the root.
         value, slope = jax.jvp(height, (at,), (jnp.ones_like(at),))
         slope = jax.lax.stop_gradient(slope)
         distance = at - value / jnp.where(slope == 0, 1, slope)
         u, v, _ = self.undeform(origin + at * direction, time)
         inside = (jnp.abs(u) <= self.half_width) & (jnp.abs(v) <= self.half_height)
-        return jnp.where(bracketed, distance, 0), bracketed & inside & (at > 0)
+        return jnp.where(has_root, distance, 0), has_root & inside & (at > 0)
 
     def _bracket(self, origin, direction, time):
         """The first interval between samples in which the ray crosses the cloth."""
@@ -311,9 +311,9 @@ class Sheet:
         step = jnp.where(hit, leave - enter, 1) / (PROBES - 1)
 
         # A while loop ends early for a batch of rays that all miss or have all crossed.
-        def unfinished(state):
-            index, _, crossed, _, _ = state
-            return hit & ~crossed & (index < PROBES)
+        def is_unfinished(state):
+            index, _, has_crossed, _, _ = state
+            return hit & ~has_crossed & (index < PROBES)
 
         def probe(state):
             index, _, _, u_low, height_low = state
@@ -325,13 +325,13 @@ class Sheet:
             fall = jnp.where(height_low == height, 1, height_low - height)
             crossing = u_low + height_low / fall * (u - u_low)
             on_cloth = jnp.abs(crossing) <= self.half_width
-            crossed = (height_low * height <= 0) & (height_low != height) & on_cloth
-            return index + 1, at - step, crossed, u, height
+            has_crossed = (height_low * height <= 0) & (height_low != height) & on_cloth
+            return index + 1, at - step, has_crossed, u, height
 
         u, _, height = self.undeform(origin + enter * direction, time)
         start = (jnp.int32(1), enter, jnp.zeros_like(hit), u, height)
-        _, low, crossed, _, _ = jax.lax.while_loop(unfinished, probe, start)
-        return low, low + step, crossed
+        _, low, has_crossed, _, _ = jax.lax.while_loop(is_unfinished, probe, start)
+        return low, low + step, has_crossed
 
     def _hang(self, v):
         """0 at the upper edge, 1 at the lower edge."""

@@ -75,10 +75,10 @@ def albedo(
 
     def select(coefficient):
         values = [coefficient(each) for each in textures]
-        selected = jnp.full_like(x, values[0])
+        choice = jnp.full_like(x, values[0])
         for index, value in enumerate(values[1:], 1):
-            selected = jnp.where(thing == index, jnp.asarray(value, x.dtype), selected)
-        return selected
+            choice = jnp.where(thing == index, jnp.asarray(value, x.dtype), choice)
+        return choice
 
     # With cosines, faces through the body's origin lie inside squares and not on edges.
     scale = jnp.pi / select(lambda t: t.checker_size)

@@ -99,11 +99,11 @@ def flow(spec: SceneSpec, thing, material, camera, time, transient_shown) -> Flo
       The flow, zero for the background.
     """
 
-    def one(thing, material):
+    def project(thing, material):
         point = trace.place(spec, thing, material, time)
         return trace.visible(spec, camera, thing, point, time, transient_shown)
 
-    pixel, visible = jax.lax.map(lambda row: jax.vmap(one)(*row), (thing, material))
+    pixel, visible = jax.lax.map(lambda row: jax.vmap(project)(*row), (thing, material))
     hit = thing != trace.NOTHING
     centers = rays.pixel_centers(spec.size, pixel.dtype)
     shift = jnp.where(hit[..., None], pixel - centers, 0)
@@ -142,14 +142,14 @@ def programs(spec: SceneSpec, plan: Schedule) -> Programs:
     )
     if spec.photographed:  # consecutive photographs are not neighbors
         return Programs(None)
-    lowered = [data_parallel.lower_rows(flow, spec, frame_index)]
+    lowerings = [data_parallel.lower_rows(flow, spec, frame_index)]
     if points and any(thing.moves() for thing in spec.things):
         thing, times = shape((points,), np.int32), shape((spec.frames,), np.float32)
         material = shape((points, 3), np.float32)
         places = shape((points, frames, 3), np.float32)
-        lowered.append(_follow.lower(spec, thing, material, times))
-        lowered.append(_watch.lower(spec, thing, places, plan))
-    return Programs(*(compiler.begun(one.compile) for one in lowered))
+        lowerings.append(_follow.lower(spec, thing, material, times))
+        lowerings.append(_watch.lower(spec, thing, places, plan))
+    return Programs(*(compiler.begun(lowering.compile) for lowering in lowerings))
 
 
 def flows(
@@ -229,10 +229,10 @@ def tracks(
             np.zeros((0, frames), bool),
         )
     # The programs expect `spec.tracks` points, so the last one is repeated.
-    padded = np.minimum(np.arange(spec.tracks), len(sample) - 1)
-    world = np.asarray(programs.follow.result()(thing[padded], material[padded], times))
+    rows = np.minimum(np.arange(spec.tracks), len(sample) - 1)
+    world = np.asarray(programs.follow.result()(thing[rows], material[rows], times))
     positions = world[:, plan.instant]
-    pixel, visible = programs.watch.result()(thing[padded], positions, plan)
+    pixel, visible = programs.watch.result()(thing[rows], positions, plan)
     world, pixel, visible = (
         np.asarray(x)[: len(sample)] for x in (world, pixel, visible)
     )
