@@ -66,7 +66,7 @@ def advise(
     Raises:
       ValueError: If the representation recommends no presets.
     """
-    needs = {one.effect: one.wanted for one in findings}
+    needs = {finding.effect: finding.wanted for finding in findings}
     notes = [
         f"{effect}: undecided, the setting of the preset is kept"
         for effect, choice in needs.items()
@@ -80,7 +80,7 @@ def advise(
     choice = representation.recommendation.advise(needs, full, family, seconds)
     if not full and family is None:
         moves = None if needs[COLLECTION] else needs.get(MOTION)
-        notes += _measured(representation, moves, seconds)
+        notes += _report_curves(representation, moves, seconds)
     return Advice(
         representation.name,
         choice.preset if full else f"{choice.preset}-small",
@@ -89,15 +89,15 @@ def advise(
     )
 
 
-def _measured(representation, moves, seconds):
+def _report_curves(representation, moves, seconds):
     """Report the best curves of the presets, if the advice follows from them."""
     if moves is None:
         return []
-    ranked = method_curves.ranking(representation.presets, moves, seconds)
-    best = ", ".join(f"{one.preset} {one.psnr:.1f} dB" for one in ranked[:3])
-    when = "complete runs" if seconds is None else f"{seconds:g} s of training"
+    ranking = method_curves.ranking(representation.presets, moves, seconds)
+    best = ", ".join(f"{curve.preset} {curve.psnr:.1f} dB" for curve in ranking[:3])
+    budget = "complete runs" if seconds is None else f"{seconds:g} s of training"
     scenes = "with motion" if moves else "without motion"
-    return [f"{when} on built-in scenes {scenes}: {best}"] if ranked else []
+    return [f"{budget} on built-in scenes {scenes}: {best}"] if ranking else []
 
 
 def advise_all(
@@ -168,11 +168,11 @@ def by_tracks(
         )
     _, choose = choosing[0]
     choice = choose(capture, seconds)
-    changed, lines = _config_of_choice(config, choice), []
+    new_config, lines = _config_of_choice(config, choice), []
     other = choice.alternative
     if other is not None and try_out is not None and _is_accepted(config, other):
         trial = try_out(
-            changed, _config_of_choice(config, other), capture, other.preset
+            new_config, _config_of_choice(config, other), capture, other.preset
         )
         lines = [
             f"motion: after {trial.steps} steps {trial.without:.2f} dB with "
@@ -181,10 +181,10 @@ def by_tracks(
         ]
         if trial.pays:
             lines[0] += "; motion is worth less than nothing, so the scene is static"
-            choice, changed = other, _config_of_choice(config, other)
+            choice, new_config = other, _config_of_choice(config, other)
     words = [choice.preset, *(["--set"] if choice.overrides else []), *choice.overrides]
     line = f"preset: {' '.join(words)}" + "".join(f" ({n})" for n in choice.notes)
-    return changed, [*lines, line]
+    return new_config, [*lines, line]
 
 
 def _config_of_choice(config, choice):
@@ -226,7 +226,7 @@ def follow(
     lines += [f"note: {note}" for note in advice.notes]
     same_preset = advice.preset == config.preset
     overrides = config.overrides if same_preset else user_overrides
-    changed = dataclasses.replace(
+    new_config = dataclasses.replace(
         config, preset=advice.preset, overrides=(*advice.overrides, *overrides)
     )
-    return changed, lines
+    return new_config, lines

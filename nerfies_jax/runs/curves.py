@@ -196,32 +196,32 @@ def read(folder: pathlib.Path) -> Curve:
       ValueError: The folder has neither file, or it is damaged.
     """
     folder = pathlib.Path(folder)
-    logged = course_of(folder)
+    summary = course_of(folder)
     if not (folder / CURVE).is_file():
-        if logged is None:
+        if summary is None:
             raise ValueError(
                 f"{folder}: neither {CURVE} nor {event_log.EVENTS} exists; pass a run "
                 "folder. To create them for a run of an earlier version, resume it "
                 "without further steps"
             )
-        return _curve_of(logged)
+        return _curve_of(summary)
     curve = _stored_curve(folder / CURVE)
     last_step = max(curve.steps, default=0)
-    if logged is not None and not logged.ended and logged.step > last_step:
-        return _curve_of(logged)
+    if summary is not None and not summary.ended and summary.step > last_step:
+        return _curve_of(summary)
     return curve
 
 
-def _curve_of(logged):
-    rows = [row for row in of_held_out(logged.evaluations) if "psnr" in row]
+def _curve_of(summary):
+    rows = [row for row in of_held_out(summary.evaluations) if "psnr" in row]
     return Curve(
         seconds=tuple(row["seconds"] for row in rows),
         steps=tuple(row["step"] for row in rows),
         psnr=tuple(_number(row["psnr"]) for row in rows),
         ssim=tuple(_number(row.get("ssim")) for row in rows),
-        frames=logged.frames,
-        compile_seconds=logged.compile_seconds,
-        machine=logged.machine,
+        frames=summary.frames,
+        compile_seconds=summary.compile_seconds,
+        machine=summary.machine,
         cpu_seconds=tuple(_number(row.get("cpu_seconds")) for row in rows),
     )
 

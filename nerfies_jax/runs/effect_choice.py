@@ -130,8 +130,8 @@ def compare(config: RunConfig, overrides: tuple[str, ...], capture: Capture) -> 
     Raises:
       KeyboardInterrupt: If the process was asked to stop.
     """
-    changed = dataclasses.replace(config, overrides=(*config.overrides, *overrides))
-    return compare_configs(config, changed, capture, " ".join(overrides))
+    new_config = dataclasses.replace(config, overrides=(*config.overrides, *overrides))
+    return compare_configs(config, new_config, capture, " ".join(overrides))
 
 
 def compare_configs(
@@ -193,5 +193,5 @@ def _score(run: Run, fitted_as: Run, state, rows: np.ndarray) -> float:
     if scorer is not None:
         return evaluation.known_mean(scorer(state, run.capture, rows).psnr)
     renderer = Renderer(run.model, size)
-    scored = evaluation.score(renderer, state, run.capture, rows)
-    return evaluation.known_mean(scored.psnr)
+    scores = evaluation.score(renderer, state, run.capture, rows)
+    return evaluation.known_mean(scores.psnr)

@@ -184,7 +184,7 @@ class EventReader:
         Raises:
           ValueError: If the file does not exist or cannot be read.
         """
-        received = []
+        new_events = []
         try:
             with self._path.open("rb") as file:
                 if os.fstat(file.fileno()).st_size < self._offset:
@@ -194,13 +194,13 @@ class EventReader:
                     if not line.endswith(b"\n") and len(line) < MAX_LINE_BYTES:
                         break
                     self._offset += len(line)
-                    received += _parse(line)
+                    new_events += _parse(line)
         except OSError as problem:
             raise ValueError(
                 f"{self._path}: events cannot be read ({problem.strerror}); pass the "
                 "folder of a run, which may still be running"
             ) from problem
-        return received
+        return new_events
 
 
 def _parse(line):

@@ -36,11 +36,11 @@ class Following:
         identity = None if after is None else _identity(folder)
         identity = identity or uuid.uuid4().hex[:12]
         self._log.open(folder)
-        tracked = trackers.TrackedRun(
+        tracked_run = trackers.TrackedRun(
             folder, identity, folder.name, specs.as_json(run.config), after or 0
         )
         for name in self._names:
-            sink = self._stack.enter_context(trackers.opened(name, tracked))
+            sink = self._stack.enter_context(trackers.opened(name, tracked_run))
             self._stack.enter_context(events.subscribe(sink))
         events.emit(
             "run",

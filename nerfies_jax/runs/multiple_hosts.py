@@ -52,13 +52,13 @@ def sharing(folder: pathlib.Path, run: Run) -> Iterator[Run]:
         return
     hosts.send(hosts.RUN, folder=str(folder.absolute()))
     with data_parallel.spanning_hosts():
-        shared = rebuilt(run)
+        shared_run = rebuilt(run)
         console.say(
-            f"{jax.process_count()} processes train, with {shared.model.devices} "
+            f"{jax.process_count()} processes train, with {shared_run.model.devices} "
             "devices in all"
         )
         try:
-            yield shared
+            yield shared_run
         except (jax.errors.JaxRuntimeError, ValueError) as error:
             if not hosts.is_loss(error):
                 raise

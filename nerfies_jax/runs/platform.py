@@ -88,8 +88,8 @@ def start_jax(
     from nerfies_jax.runtime import data_parallel, hosts
 
     count = min(shares, cores()) if devices is None else devices
-    forced = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if count > 1 and not forced and "JAX_NUM_CPU_DEVICES" not in os.environ:
+    is_set = "--xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if count > 1 and not is_set and "JAX_NUM_CPU_DEVICES" not in os.environ:
         # The number of devices cannot change if JAX has already been initialized.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", count)

@@ -110,10 +110,10 @@ def prepare(
         source_images = _source_images(kind, source, scratch, how)
         for line in source_images.notes:
             tell(line)
-        solved = _solve(scratch, source_images, how, tell)
-        for line in solved.lines:
+        solution = _solve(scratch, source_images, how, tell)
+        for line in solution.lines:
             tell(line)
-        capture = colmap.read(solved.poses.folder)
+        capture = colmap.read(solution.poses.folder)
         rate = None
         if source_images.seconds:
             rate = (len(source_images.names) - 1) / source_images.seconds
@@ -125,10 +125,10 @@ def prepare(
         target = scratch / "capture"
         with events.stage("writing the capture"):
             nerfies_format.write(capture, target)
-        shutil.copytree(solved.poses.folder / "sparse", target / "colmap" / "sparse")
-        if solved.masked and how.masks is None:
+        shutil.copytree(solution.poses.folder / "sparse", target / "colmap" / "sparse")
+        if solution.masked and how.masks is None:
             (scratch / "detected").rename(target / "masks_found")
-        write_json(target / RECORD, _record(source, how, solved))
+        write_json(target / RECORD, _record(source, how, solution))
         os.replace(target, out.resolve())
     for line in describe(capture):
         tell(line)
@@ -281,10 +281,10 @@ def _write_masks(scratch, moving):
     return scratch / "black"
 
 
-def _record(source, how, solved):
-    poses = solved.poses._asdict()
+def _record(source, how, solution):
+    poses = solution.poses._asdict()
     del poses["folder"]
-    return {**_made_of(source, how), "masked": solved.masked, "poses": poses}
+    return {**_made_of(source, how), "masked": solution.masked, "poses": poses}
 
 
 def _made_of(source, how):
@@ -292,7 +292,7 @@ def _made_of(source, how):
     _check_masks(how)
     masks = None if how.masks is None else _checksum(pathlib.Path(how.masks))
     # The number of threads changes only the duration.
-    how = {name: one for name, one in specs.as_json(how).items() if name != "threads"}
+    how = {k: x for k, x in specs.as_json(how).items() if k != "threads"}
     return {
         "source": str(source.resolve()),
         "content": _checksum(source),
@@ -363,12 +363,12 @@ def prepared(
             f"{out / RECORD}: damaged ({error}), so the source of {out} is unknown; "
             "remove the folder, or choose another one with out=..."
         ) from error
-    requested = json.loads(json.dumps(_made_of(source, how)))
-    changed = [name for name, value in requested.items() if made_of.get(name) != value]
-    if changed:
+    identity = json.loads(json.dumps(_made_of(source, how)))
+    changes = [name for name, value in identity.items() if made_of.get(name) != value]
+    if changes:
         raise ValueError(
             f"{out}: a capture converted from another source or with other settings "
-            f"({', '.join(changed)} differ); remove it, or choose another folder with "
+            f"({', '.join(changes)} differ); remove it, or choose another folder with "
             "out=..."
         )
     tell(f"{source} has already been converted: {out}")

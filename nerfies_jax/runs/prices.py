@@ -68,11 +68,11 @@ def format_prices(findings: tuple[Finding, ...]) -> dict[str, str]:
       Texts by effect.
     """
     return {
-        one.effect: " / ".join(
+        finding.effect: " / ".join(
             f"x{factor:.2f}" if math.isfinite(factor) else "-"
-            for factor in price(one.effect, baseline()).values()
+            for factor in price(finding.effect, baseline()).values()
         )
-        for one in findings
+        for finding in findings
     }
 
 
@@ -85,10 +85,10 @@ def as_json(findings: tuple[Finding, ...]) -> dict[str, dict[str, float | None]]
     Returns:
       Factors by effect and representation, None if it adds nothing to a step.
     """
-    prices = {one.effect: price(one.effect, baseline()) for one in findings}
+    prices = {finding.effect: price(finding.effect, baseline()) for finding in findings}
     return {
-        effect: {k: x if math.isfinite(x) else None for k, x in one.items()}
-        for effect, one in prices.items()
+        effect: {k: x if math.isfinite(x) else None for k, x in factors.items()}
+        for effect, factors in prices.items()
     }
 
 

@@ -83,14 +83,14 @@ def make(
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
     rows, skipped_frames = _frames_to_score(run, trained)
-    scored = evaluation.score(trained.draw, state, run.observed, rows)
-    if not np.isfinite(scored.color).all():
+    scores = evaluation.score(trained.draw, state, run.observed, rows)
+    if not np.isfinite(scores.color).all():
         raise FloatingPointError(
             f"no report: the images rendered at step {trained.result.steps:,} are not "
             "finite"
         )
-    quality.check_learned(trained.result.history, scored)
-    ms_per_frame = renderer.ms_per_frame(len(scored.rows))
+    quality.check_learned(trained.result.history, scores)
+    ms_per_frame = renderer.ms_per_frame(len(scores.rows))
     # Products of an earlier call are replaced together or not at all.
     attempt = Attempts(all_or_none=(folder / METRICS).exists())
     with _stage(folder) as target:
@@ -101,28 +101,28 @@ def make(
         with step_profile.profiling(run, state, extra.step_profile) as profile:
             figures = [*player]
             seconds = ms_per_frame / 1e3
-            halves = fitted_halves(run, state, trained.scorer, scored, seconds)
+            halves = fitted_halves(run, state, trained.scorer, scores, seconds)
             comparison = attempt(
                 None,
                 _save_comparison,
                 target / "comparison.png",
                 run.observed,
-                scored if halves is None else _right_halves(scored, halves),
+                scores if halves is None else _right_halves(scores, halves),
             )
             if comparison is not None:
                 caption = COMPARISON_CAPTION + ("" if halves is None else HALVES)
                 figures.append(report.Figure(comparison, caption))
-            watched = [run.capture.ids[row] for row in trained.watched]
+            frame_ids = [run.capture.ids[row] for row in trained.watched]
             course = curves.course_of(folder)
             history = trained.result.history
-            attempt(None, curves.write, target, history, watched, course)
+            attempt(None, curves.write, target, history, frame_ids, course)
             path = target / "psnr_over_time.png"
-            fitted_metrics, fit_notes = _fitted_metrics(scored, halves, run.capture)
+            fitted_metrics, fit_notes = _fitted_metrics(scores, halves, run.capture)
             final = curve_figure.Result(
                 fitted_metrics[0].value
                 if fitted_metrics
-                else evaluation.known_mean(scored.psnr),
-                len(scored.rows),
+                else evaluation.known_mean(scores.psnr),
+                len(scores.rows),
                 is_fitted=bool(fitted_metrics),
             )
             curve = attempt(
@@ -135,23 +135,23 @@ def make(
             video = attempt(
                 None, _with_extra, save_video, path, run, renderer, state, seconds
             )
-            attempt(None, save_depth, target / "depth", run.capture, scored)
+            attempt(None, save_depth, target / "depth", run.capture, scores)
             save = run.representation.products.save
             model = run.spec, run.metadata, state
             with events.stage("saving the model"):
-                saved = attempt(Saved(), save, target, *model)
+                exports = attempt(Saved(), save, target, *model)
             numbers, quality_notes = quality.measure(
-                run, state, trained.draw, scored, extra, seconds
+                run, state, trained.draw, scores, extra, seconds
             )
             metrics = heldout.metrics(numbers)
-            metrics += measured(run, trained, scored, ms_per_frame, start_time)
-            metrics += [*fitted_metrics, *model_size(saved)]
+            metrics += measured(run, trained, scores, ms_per_frame, start_time)
+            metrics += [*fitted_metrics, *model_size(exports)]
             attempt(None, _save_metrics, target / METRICS, metrics)
             main = {each.key: each.value for each in metrics}
             warnings = baselines_text.warnings(main, quality.tracked_share(run, main))
             notes = [*warnings, trained.result.message, *skipped_frames]
             notes += _capture_notes(run, folder)
-            notes += [*quality_notes, *fit_notes, *saved.notes, *player_notes]
+            notes += [*quality_notes, *fit_notes, *exports.notes, *player_notes]
             step_ms, profile_notes = profile()
         notes += profile_notes
     page = attempt(
@@ -321,19 +321,19 @@ def fitted_halves(
     return scorer(state, run.capture, scored.rows[places])
 
 
-def _fitted_metrics(scored, halves, capture):
+def _fitted_metrics(scores, halves, capture):
     """Return metrics of fitted right halves and a note, both empty without them."""
     if halves is None:
         return [], ()
-    colors = scored.color[np.isin(scored.rows, halves.rows)]
+    colors = scores.color[np.isin(scores.rows, halves.rows)]
     before = evaluation.score_right_halves(capture, halves.rows, colors)
     psnr, ssim = (evaluation.known_mean(each) for each in (halves.psnr, halves.ssim))
-    unfitted = evaluation.known_mean(before.psnr)
+    unfitted_psnr = evaluation.known_mean(before.psnr)
     note = (
         f"The main result follows {PROTOCOL}. The right halves of {len(colors)} "
         f"held-out frames have {psnr:.2f} dB with codes fitted to the left halves, "
-        f"without the transient field, and {unfitted:.2f} dB without fitting, with "
-        "codes interpolated in time."
+        f"without the transient field, and {unfitted_psnr:.2f} dB without fitting, "
+        "with codes interpolated in time."
     )
     metrics = [
         metric("heldout.fitted_psnr", psnr, 0.2),
@@ -342,15 +342,15 @@ def _fitted_metrics(scored, halves, capture):
     return metrics, (note,)
 
 
-def _right_halves(scored, halves):
+def _right_halves(scores, halves):
     """Return the fitted right halves of frames, with depths of the whole renders."""
-    same = np.isin(scored.rows, halves.rows)
-    left = scored.color.shape[2] - halves.color.shape[2]
+    is_fitted = np.isin(scores.rows, halves.rows)
+    left = scores.color.shape[2] - halves.color.shape[2]
     return Scored(
         halves.rows,
         np.clip(halves.color, 0, 1),
-        scored.alpha[same, :, left:],
-        scored.depth[same, :, left:],
+        scores.alpha[is_fitted, :, left:],
+        scores.depth[is_fitted, :, left:],
         halves.psnr,
         halves.ssim,
     )
@@ -358,19 +358,19 @@ def _right_halves(scored, halves):
 
 @events.stage("drawing the comparison")
 def _save_comparison(
-    path: pathlib.Path, capture: Capture, scored: Scored
+    path: pathlib.Path, capture: Capture, scores: Scored
 ) -> pathlib.Path:
     """Save truth, render, error and depth of a few held-out frames.
 
     Renders that are narrower than the images show their right part.
     """
-    places = evaluation.spread(np.arange(len(scored.rows)), COMPARISON_FRAMES)
+    places = evaluation.spread(np.arange(len(scores.rows)), COMPARISON_FRAMES)
     captions = [
-        f"frame {capture.ids[scored.rows[i]]}   {scored.psnr[i]:.2f} dB   "
-        f"SSIM {scored.ssim[i]:.3f}"
+        f"frame {capture.ids[scores.rows[i]]}   {scores.psnr[i]:.2f} dB   "
+        f"SSIM {scores.ssim[i]:.3f}"
         for i in places
     ]
-    rows, color = scored.rows[places], scored.color[places]
+    rows, color = scores.rows[places], scores.color[places]
     left = capture.size[0] - color.shape[2]
     truth = capture.images[rows, :, left:]
     # Pixels that were not observed are black in both, so that they show no error.
@@ -380,9 +380,9 @@ def _save_comparison(
     image = panels.comparison(
         truth,
         color,
-        scored.depth[places],
+        scores.depth[places],
         captions,
-        known_depth=scored.alpha[places] > 0.5,
+        known_depth=scores.alpha[places] > 0.5,
     )
     panels.save(image, path)
     return path
@@ -501,8 +501,10 @@ def _next(folder, run, trained, base=None):
     if trained.result.steps < run.spec.steps:
         line = commands.resume(folder, run.code, base)
         return [render, report.Command("Continue training to the last step:", line)]
-    others = tuple(o for o in run.config.overrides if not o.startswith("steps="))
-    longer = dataclasses.replace(run.config, steps=2 * run.spec.steps, overrides=others)
+    overrides = tuple(o for o in run.config.overrides if not o.startswith("steps="))
+    longer = dataclasses.replace(
+        run.config, steps=2 * run.spec.steps, overrides=overrides
+    )
     line = commands.reconstruct(longer, base)
     return [render, report.Command("Train for twice as many steps:", line)]
 

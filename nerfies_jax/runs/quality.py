@@ -59,8 +59,8 @@ def prepared(more: MoreMetrics) -> Extra:
     lpips, network = None, NETWORKS[more.lpips_network]
     if more.lpips_weights or perceptual.installed_weights(network) is not None:
         lpips = Lpips(network, perceptual.load(network, more.lpips_weights))
-    required = bool(more.lpips_weights)
-    return Extra(lpips, more.fit_heldout_cameras, more.step_profile, required)
+    is_required = bool(more.lpips_weights)
+    return Extra(lpips, more.fit_heldout_cameras, more.step_profile, is_required)
 
 
 def fitting(extra: Extra, size: tuple[int, int]) -> Extra:
@@ -108,7 +108,7 @@ def measure(
     Returns:
       Values by the keys of `heldout.TOLERANCES`, and notes.
     """
-    ground_truth = tracked = flow = camera_fit = None
+    ground_truth = tracks = flow = camera_fit = None
     capture, note = moving_masks.with_masks(run.observed, CACHE / "evidence")
     notes = [note] if note else []
     try:
@@ -121,7 +121,7 @@ def measure(
         notes.append(f"Tracks were not evaluated: {error}")
     if ground_truth is not None:
         kind, scene = run.representation, (run.spec, run.metadata)
-        tracked = kind.scoring.follow(*scene, state, capture, ground_truth)
+        tracks = kind.scoring.follow(*scene, state, capture, ground_truth)
         move = kind.scoring.mover(*scene)
         if move is not None:
             flow = model_flow.heldout_flow(move, state, capture, scored)
@@ -150,7 +150,7 @@ def measure(
         capture,
         lpips=extra.lpips,
         known=ground_truth,
-        followed=tracked,
+        followed=tracks,
         flow=flow,
         fitted=camera_fit,
         baselines=_baselines(run, state, draw, scored.rows, frame_seconds),

@@ -255,8 +255,8 @@ def _with_cameras(config, out, how):
         return config
     out = out or pathlib.Path("runs") / source.stem
     folder = preparation.prepared(source, out.with_name(f"{out.name}-capture"), how)
-    named = dataclasses.replace(config.source, capture=folder)
-    return dataclasses.replace(config, source=named)
+    new_source = dataclasses.replace(config.source, capture=folder)
+    return dataclasses.replace(config, source=new_source)
 
 
 def _sets_steps(config):
@@ -271,14 +271,14 @@ def _new_run(config, effects, seconds):
     capture = stored_capture(config.source, config.seed)
     new_config, lines = config, []
     if config.preset is None:
-        planned = None if _sets_steps(config) else seconds
+        budget = None if _sets_steps(config) else seconds
         try_out = None if effects == "preset" else effect_choice.compare_configs
-        new_config, lines = adviser.by_tracks(config, capture, planned, try_out)
+        new_config, lines = adviser.by_tracks(config, capture, budget, try_out)
         if effects != "preset":
-            new_config, more = effect_choice.choose(
+            new_config, effect_lines = effect_choice.choose(
                 new_config, capture, config.overrides
             )
-            lines += more
+            lines += effect_lines
     else:
         findings = inspection.inspect(capture, CACHE / "evidence").findings
         new_config, lines = adviser.follow(new_config, config.overrides, findings)
@@ -294,7 +294,7 @@ def _describe(run):
         console.say(line)
 
 
-def _check_expected(folder, expected):
+def _check_expected(folder, settings):
     """Check that a run was started with the expected settings.
 
     Returns the new paths of files of its source that have been moved, by field name.
@@ -302,14 +302,14 @@ def _check_expected(folder, expected):
     """
     config = read_config(folder)
     values = {**vars(config), **vars(config.source)}
-    capture, source = values["capture"], expected.get("capture")
+    capture, source = values["capture"], settings.get("capture")
     if capture is not None and source is not None and run_folder.is_of(capture, source):
-        expected = {**expected, "capture": capture}  # also if `source` is its video
-    new_paths = {k: x for k, x in expected.items() if _has_moved(values[k], x)}
+        settings = {**settings, "capture": capture}  # also if `source` is its video
+    new_paths = {k: x for k, x in settings.items() if _has_moved(values[k], x)}
     values = values | new_paths
     differences = [
         f"{name.replace('_', '-')}: saved {values[name]}, now {value}"
-        for name, value in expected.items()
+        for name, value in settings.items()
         if value != values[name]
     ]
     if differences:
@@ -338,8 +338,8 @@ def _restore(folder, run):
     """
     if checkpoint.latest(folder / run_folder.CHECKPOINTS) is None:
         return initial_state(run), None, None
-    restored = restore(folder, run, newest=True)
-    return restored.state, restored.record, restored.step
+    latest = restore(folder, run, newest=True)
+    return latest.state, latest.record, latest.step
 
 
 def _open_checkpoints(stack, folder, run, state, after):
@@ -360,8 +360,8 @@ def _hooks(stack, watched, run, folder):
 
 def _train(folder, run, start, pace, hooks, start_time, extra):
     """Train a run to its end and write its products."""
-    with multiple_hosts.sharing(folder, run) as shared:
-        trained = train.train(shared, *start, pace, hooks)
+    with multiple_hosts.sharing(folder, run) as shared_run:
+        trained = train.train(shared_run, *start, pace, hooks)
     result = trained.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):

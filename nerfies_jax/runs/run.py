@@ -105,16 +105,16 @@ def open_run(
     return _build(config, representation, spec, capture, observed)
 
 
-def _add_required(capture, required):
+def _add_required(capture, required_data):
     """Add optical flow and masks computed from the images if the model needs them.
 
     Missing depth cannot be computed and becomes a note.
     """
-    if "flow" in required and capture.flow is None:
+    if "flow" in required_data and capture.flow is None:
         capture = frame_flow.with_flow(capture)
-    if "moving" in required and capture.moving is None:
+    if "moving" in required_data and capture.moving is None:
         capture = frame_masks.with_masks(capture)
-    if "depths" in required and capture.depths is None:
+    if "depths" in required_data and capture.depths is None:
         note = (
             "this preset can also use depth maps, but the capture has none: its depth "
             "loss is disabled"
@@ -246,8 +246,8 @@ def saved_run(
     """
     folder = pathlib.Path(folder)
     config, kind, spec = read_settings(folder, trusted)
-    requested = specs.override(spec, overrides)
-    changes = specs.differences(specs.as_json(spec), specs.as_json(requested))
+    new_spec = specs.override(spec, overrides)
+    changes = specs.differences(specs.as_json(spec), specs.as_json(new_spec))
     if changes:
         raise ValueError(
             f"{folder}: the run was started with other settings: {'; '.join(changes)}; "
@@ -292,9 +292,11 @@ def read_settings(folder: pathlib.Path, trusted: Collection[str] = ()) -> Settin
     return Settings(config, kind, spec)
 
 
-def _check_type(value, expected):
-    if not isinstance(value, expected):
-        raise ValueError(f"expected {expected.__name__}, got {type(value).__name__}")
+def _check_type(value, expected_type):
+    if not isinstance(value, expected_type):
+        raise ValueError(
+            f"expected {expected_type.__name__}, got {type(value).__name__}"
+        )
 
 
 def read_config(folder: pathlib.Path) -> RunConfig:
@@ -363,13 +365,13 @@ def initial_state(run: Run) -> TrainState:
     """
     resources = run.representation.resources
     if resources.estimate_memory_bytes is not None:
-        needed = resources.estimate_memory_bytes(run.spec, run.capture)
-        needed -= frame_memory.capture_bytes(run.capture)  # already allocated
+        needed_bytes = resources.estimate_memory_bytes(run.spec, run.capture)
+        needed_bytes -= frame_memory.capture_bytes(run.capture)  # already allocated
         free = free_memory()
-        if needed > free:
+        if needed_bytes > free:
             raise ValueError(
-                f"the initial training state needs about {needed / 2**30:.1f} GiB of "
-                f"memory, but {free / 2**30:.1f} GiB are free; "
+                f"the initial training state needs about {needed_bytes / 2**30:.1f} "
+                f"GiB of memory, but {free / 2**30:.1f} GiB are free; "
                 f"{resources.memory_hint}, or read smaller images with max_side=..."
             )
     return run.model.init(run.capture, jax.random.key(run.config.seed))
@@ -401,9 +403,9 @@ def restore(
     """
     model, checkpoints = run.model, folder / CHECKPOINTS
     example = (model.example or model.init)(run.capture, jax.random.key(0))
-    restored = checkpoint.restore(checkpoints, example, model.spec)
-    evaluations = (restored.record or {}).get("evaluations", ())
+    latest = checkpoint.restore(checkpoints, example, model.spec)
+    evaluations = (latest.record or {}).get("evaluations", ())
     step = best.best_step(evaluations)
-    if newest or step == restored.step or step not in checkpoint.steps(checkpoints):
-        return restored
+    if newest or step == latest.step or step not in checkpoint.steps(checkpoints):
+        return latest
     return checkpoint.restore(checkpoints, example, model.spec, step=step)

@@ -36,8 +36,8 @@ class Screen:
 
     def __init__(self, run: Run, full: tuple[int, int]):
         self.run = run
-        traced = run.model.stages is None
-        pixels = TRACED_PIXELS if traced else RASTERIZED_PIXELS
+        is_traced = run.model.stages is None
+        pixels = TRACED_PIXELS if is_traced else RASTERIZED_PIXELS
         self.pyramid = interactive.pyramid(full, pixels)
         settings = run.spec, run.metadata
         self.parts = run.representation.products.parts(*settings)
@@ -148,9 +148,9 @@ class Screen:
             self._keep_limits(look.channel, image)
         # The first call may include compilation, which `renderer.seconds` excludes.
         first = key not in self._seconds
-        elapsed = renderer.seconds[-1] if first else time.perf_counter() - start_time
+        duration = renderer.seconds[-1] if first else time.perf_counter() - start_time
         recent = self._seconds.setdefault(key, collections.deque(maxlen=TIMED_TILES))
-        recent.append(elapsed)
+        recent.append(duration)
         return image.image
 
     def model(self, without: tuple[str, ...]) -> Model:

@@ -125,15 +125,17 @@ def train(
     def held_out(state, step, metrics):
         del step, metrics
         capture = evaluation.with_refined_cameras(run.model, state, run.observed)
-        scored = evaluation.score(renderer, state, capture, rows)
+        scores = evaluation.score(renderer, state, capture, rows)
         numbers = {
-            "psnr": evaluation.known_mean(scored.psnr),
-            "ssim": evaluation.known_mean(scored.ssim),
+            "psnr": evaluation.known_mean(scores.psnr),
+            "ssim": evaluation.known_mean(scores.ssim),
         }
         if scorer is None:
             return numbers
-        observed = evaluation.with_refined_cameras(run.model, state, run.capture)
-        halves = scorer(state, observed, rows)
+        training_capture = evaluation.with_refined_cameras(
+            run.model, state, run.capture
+        )
+        halves = scorer(state, training_capture, rows)
         return {
             "psnr": evaluation.known_mean(halves.psnr),
             "ssim": evaluation.known_mean(halves.ssim),
@@ -215,10 +217,10 @@ def _with_best(run, result, checkpoints):
     if outcome.step not in {*checkpoint.steps(checkpoints.folder)} - {result.steps}:
         return result
     example = (run.model.example or run.model.init)(run.capture, jax.random.key(0))
-    restored = checkpoint.restore(
+    best_checkpoint = checkpoint.restore(
         checkpoints.folder, example, run.model.spec, step=outcome.step
     )
-    return result._replace(state=restored.state)
+    return result._replace(state=best_checkpoint.state)
 
 
 def _compile(run, state, frames, renderer, view) -> float:

@@ -41,9 +41,9 @@ def check(
         names = outside_names(stored, spec_type)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
-    untrusted = tuple(name for name in names if name not in trusted)
-    if untrusted:
-        raise UntrustedCode(folder, untrusted)
+    untrusted_names = tuple(name for name in names if name not in trusted)
+    if untrusted_names:
+        raise UntrustedCode(folder, untrusted_names)
 
 
 def outside_names(stored: Any, spec_type: type) -> tuple[str, ...]:
@@ -66,11 +66,11 @@ def outside_names(stored: Any, spec_type: type) -> tuple[str, ...]:
         isinstance(each, str) for each in overrides
     ):
         raise ValueError(f"overrides must be strings, got {overrides!r}")
-    allowed = specs.allowed_names(spec_type)
+    allowed_names = specs.allowed_names(spec_type)
     in_spec = [
         name
         for name in extensions.names_in(stored.get("spec"), specs.TYPE)
-        if name not in allowed
+        if name not in allowed_names
     ]
     in_overrides = extensions.names_in_assignments(overrides)
     return tuple(dict.fromkeys((*in_overrides, *in_spec)))

@@ -156,8 +156,8 @@ def hooks(run: Run, renderer: Renderer) -> tuple[Hook, ...]:
 
     def evaluate(state, step, metrics):
         del step, metrics
-        scored = evaluation.score(renderer, state, run.observed, left_out)
-        return {"psnr": evaluation.known_mean(scored.psnr)}
+        scores = evaluation.score(renderer, state, run.observed, left_out)
+        return {"psnr": evaluation.known_mean(scores.psnr)}
 
     unit = EVALUATIONS * chunk.LENGTH
     interval = max(run.spec.steps // unit, 1) * chunk.LENGTH

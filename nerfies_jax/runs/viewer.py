@@ -102,8 +102,8 @@ class Viewer:
     @property
     def holds_training(self) -> bool:
         """True if training must wait: it is paused, or a path is being rendered."""
-        paused = self.training.is_paused(len(self._server.get_clients()))
-        return paused or self.path.rendering is not None
+        is_paused = self.training.is_paused(len(self._server.get_clients()))
+        return is_paused or self.path.rendering is not None
 
     def close(self) -> None:
         """Disconnect every browser and stop listening."""
@@ -180,8 +180,8 @@ class Viewer:
         now, before = time.monotonic(), self._clock
         self._clock = now
         if self._play.value:
-            elapsed = (now - before) * self._speed.value / self._seconds
-            self._show_time((self._time.value + elapsed) % 1)
+            step = (now - before) * self._speed.value / self._seconds
+            self._show_time((self._time.value + step) % 1)
 
     def _show_time(self, time):
         self._time.value = round(float(time), 3)

@@ -22,12 +22,12 @@ _patching = threading.Lock()
 
 def _refusal(host: str | None, origin: str | None, port: int) -> str | None:
     """Decide whether a request is refused."""
-    allowed = [f"{name}:{port}" for name in NAMES]
+    allowed_hosts = [f"{name}:{port}" for name in NAMES]
     if port == 80:
-        allowed += NAMES
-    if host is None or host.lower() not in allowed:
+        allowed_hosts += NAMES
+    if host is None or host.lower() not in allowed_hosts:
         return (
-            f"Host {host!r} is not {' or '.join(allowed)}. To view from another "
+            f"Host {host!r} is not {' or '.join(allowed_hosts)}. To view from another "
             "machine, forward this port with the same number: "
             f"ssh -L {port}:{HOST}:{port}"
         )
@@ -36,7 +36,7 @@ def _refusal(host: str | None, origin: str | None, port: int) -> str | None:
             parts = urllib.parse.urlsplit(origin)
         except ValueError:
             parts = urllib.parse.urlsplit("")
-        if parts.scheme != "http" or parts.netloc.lower() not in allowed:
+        if parts.scheme != "http" or parts.netloc.lower() not in allowed_hosts:
             return f"Origin {origin!r} is another site."
     return None
 
@@ -99,11 +99,11 @@ class _DisconnectFilter(logging.Filter):
 
     def filter(self, record):
         error = record.exc_info[1] if record.exc_info else None
-        visited = []
-        while error is not None and error not in visited:
+        chain = []
+        while error is not None and error not in chain:
             if isinstance(error, EOFError | ConnectionError):
                 return False
-            visited.append(error)
+            chain.append(error)
             error = error.__cause__ or error.__context__
         return True
 

@@ -289,14 +289,16 @@ class PathPanel:
             file = pathlib.Path(folder) / "camera path"
             file.write_bytes(content)
             try:
-                loaded = path_files.read_keyframes(file, self._screen.run.capture)
+                new_keyframes = path_files.read_keyframes(
+                    file, self._screen.run.capture
+                )
             except CaptureError as error:
                 reason = str(error).replace(f"{file}: ", "")
                 self._message.content = f"Could not be loaded: {reason}"
                 return
-        self.keyframes = loaded
+        self.keyframes = new_keyframes
         self._update()
-        self._message.content = f"{len(loaded)} keyframes loaded."
+        self._message.content = f"{len(new_keyframes)} keyframes loaded."
 
     # Rendering
 
@@ -332,15 +334,15 @@ class PathPanel:
 
     def _advance_rendering(self, state):
         try:
-            done = self.rendering.send(state)
+            count = self.rendering.send(state)
         except StopIteration:
             self._end_rendering(f"{self._total} images: `{self._out}`")
             console.say(f"{self._total} images: {self._out}")
         except (CaptureError, OSError, ValueError) as error:
             self._end_rendering(f"Could not be rendered: {error}")
         else:
-            self._progress.value = 100.0 * done / self._total
-            self._message.content = f"{done} of {self._total} images rendered."
+            self._progress.value = 100.0 * count / self._total
+            self._message.content = f"{count} of {self._total} images rendered."
 
     def _end_rendering(self, message):
         self.close()

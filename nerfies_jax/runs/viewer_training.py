@@ -93,8 +93,8 @@ class TrainingPanel:
             self._pause(False)
         return self.paused
 
-    def _pause(self, paused):
-        self.paused = paused
+    def _pause(self, is_paused):
+        self.paused = is_paused
         self._connected_time = time.monotonic()
         if self._button is not None:
-            self._button.label = "resume training" if paused else "pause training"
+            self._button.label = "resume training" if is_paused else "pause training"

@@ -182,8 +182,8 @@ class Window:
         image, pyramid, now = self._image, self._screen.pyramid, time.monotonic()
         # The first level of a view is completed even if the view has changed since.
         # Otherwise nothing would be shown while the camera moves.
-        finished = image.complete is not None or not image.cells
-        if image.view != (eye, look) and finished:
+        is_replaceable = image.complete is not None or not image.cells
+        if image.view != (eye, look) and is_replaceable:
             self._image = image = _Image(view=(eye, look), start_time=now)
         eye, look = image.view
         moving = now - image.start_time < STATIC_SECONDS
@@ -209,13 +209,13 @@ class Window:
         cell = image.cells.pop(0)
         tile = self._screen.draw(state, eye, look, image.level, cell)
         image.paste(tile, cell, pyramid.tile)
-        done, now = not image.cells, time.monotonic()
-        if done:
+        is_complete, now = not image.cells, time.monotonic()
+        if is_complete:
             image.complete = image.level
         # The first level is not sent before it is complete, because the rest of its
         # canvas is black.
         due = now - self._send_time > PARTIAL_SECONDS
-        if done or (image.complete is not None and due):
+        if is_complete or (image.complete is not None and due):
             self._background, self._send_time = None, now
             self._send_image(image.canvas, format="jpeg")
         self._describe(image, look, step)
