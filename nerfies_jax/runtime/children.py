@@ -22,7 +22,7 @@ PARENT = "NERFIES_JAX_PARENT"  # environment variable with the process id of the
 POLL_SECONDS = 0.5
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of linux/prctl.h
 
-_started: "weakref.WeakSet[subprocess.Popen]" = weakref.WeakSet()
+_children: "weakref.WeakSet[subprocess.Popen]" = weakref.WeakSet()
 
 
 def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -50,14 +50,14 @@ def start(command: Sequence[str | os.PathLike], **options: Any) -> subprocess.Po
     child = subprocess.Popen(
         command, env=environment(options.pop("env", None)), **options
     )
-    _started.add(child)
+    _children.add(child)
     stopping.at_end(_kill)
     return child
 
 
 def _kill():
     """Kill the children, so that their incomplete files can be removed."""
-    for child in list(_started):
+    for child in list(_children):
         if child.returncode is None:
             child.kill()
 

@@ -113,8 +113,8 @@ class SafeStream:
             self._stream.write(text)
         except UnicodeEncodeError:
             encoding = self._stream.encoding
-            escaped = text.encode(encoding, "backslashreplace").decode(encoding)
-            self._stream.write(escaped)
+            printable = text.encode(encoding, "backslashreplace").decode(encoding)
+            self._stream.write(printable)
 
     def writelines(self, lines) -> None:
         """Write several lines.

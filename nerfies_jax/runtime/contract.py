@@ -111,7 +111,7 @@ def checked(
         original = values
         if images:
             values = _with_float_images(plan, values, images)
-        unchanged = values is original
+        is_original = values is original
         sizes: dict[str, tuple[Any, str]] = {}
         batches: list[tuple[tuple[int, ...], str]] | None = [] if broadcast else None
         for name, check in plan.checks:
@@ -119,7 +119,7 @@ def checked(
                 values[name] = _check(plan.title, check, values[name], sizes, batches)
         if batches and any(shape for shape, _ in batches):
             return _map(plan, function, batches, values, positional)
-        if key is not None and unchanged and len(valid) < CACHE_SIZE:
+        if key is not None and is_original and len(valid) < CACHE_SIZE:
             valid.add(key)
         return _call(function, values, positional)
 
@@ -248,15 +248,15 @@ def _check_kind(title, check, array):
     ):
         return
     if "prng_key" in check.kinds:
-        expected, remedy = "a key", "create it with jax.random.key(seed)"
+        category, remedy = "a key", "create it with jax.random.key(seed)"
     elif "float32" in check.kinds:
-        expected, remedy = "floating-point", "cast it with .astype(jnp.float32)"
+        category, remedy = "floating-point", "cast it with .astype(jnp.float32)"
     elif "bool" in check.kinds:
-        expected, remedy = "boolean", "convert it with a comparison such as mask != 0"
+        category, remedy = "boolean", "convert it with a comparison such as mask != 0"
     else:
-        expected, remedy = "integer", "cast it with .astype(jnp.int32)"
+        category, remedy = "integer", "cast it with .astype(jnp.int32)"
     raise ValueError(
-        f"{title}: `{check.name}` must be {expected}, got {kind}{list(array.shape)}; "
+        f"{title}: `{check.name}` must be {category}, got {kind}{list(array.shape)}; "
         f"{remedy}"
     )
 
@@ -336,7 +336,7 @@ def _with_float_images(plan, values, images):
     wide = any(values[name].dtype == np.float64 for name in names)
     wide = wide and jax.config.jax_enable_x64
     masks = [shape for name, shape in shapes.items() if name not in images]
-    converted = {}
+    float_images = {}
     for name in names:
         image, kind = values[name], np.dtype(values[name].dtype).name
         if kind in FULL_SCALE:
@@ -354,8 +354,8 @@ def _with_float_images(plan, values, images):
         if gray:
             image = image[..., None]
         if image is not values[name]:
-            converted[name] = image
-    return values | converted if converted else values
+            float_images[name] = image
+    return values | float_images if float_images else values
 
 
 def _map(plan, function, batches, values, positional):
@@ -373,31 +373,33 @@ def _map(plan, function, batches, values, positional):
         if values.get(name) is not None
     ]
     leaves = [leaf for _, check, value in arrays for leaf in _leaves(check, value)]
-    squeezed, axes = [], []
+    operands, axes = [], []
     for leaf, (shape, _) in zip(leaves, batches, strict=True):
         missing = len(batch) - len(shape)
         # Axes that are missing or broadcast from length one are not mapped.
-        mapped = [
+        mapped_axes = [
             axis >= missing and shape[axis - missing] == batch[axis]
             for axis in range(len(batch))
         ]
         broadcast = [
-            axis - missing for axis in range(missing, len(batch)) if not mapped[axis]
+            axis - missing
+            for axis in range(missing, len(batch))
+            if not mapped_axes[axis]
         ]
-        squeezed.append(jnp.squeeze(leaf, broadcast) if broadcast else leaf)
-        axes.append([0 if is_mapped else None for is_mapped in mapped])
+        operands.append(jnp.squeeze(leaf, broadcast) if broadcast else leaf)
+        axes.append([0 if is_mapped else None for is_mapped in mapped_axes])
 
-    def one(*leaves):
+    def call(*leaves):
         remaining = iter(leaves)
-        replaced = {
+        new_values = {
             name: _replace_leaves(check, value, remaining)
             for name, check, value in arrays
         }
-        return _call(function, values | replaced, positional)
+        return _call(function, values | new_values, positional)
 
     for level in reversed(range(len(batch))):
-        one = jax.vmap(one, tuple(axis[level] for axis in axes))
-    return one(*squeezed)
+        call = jax.vmap(call, tuple(axis[level] for axis in axes))
+    return call(*operands)
 
 
 def _call(function, values, positional):

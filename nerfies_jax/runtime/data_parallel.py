@@ -201,14 +201,14 @@ def _on_mesh(work, shares, mesh, *inputs):
     def on_device(first, *inputs):
         return lax.map(lambda i: work(first[0] + i, *inputs), indices[:per_device])
 
-    sharded = jax.shard_map(
+    program = jax.shard_map(
         on_device,
         mesh=mesh,
         in_specs=(PartitionSpec(AXIS), *(PartitionSpec() for _ in inputs)),
         out_specs=PartitionSpec(AXIS),
         check_vma=False,  # not supported for results of a `while_loop`
     )
-    return sharded(indices[::per_device], *inputs)
+    return program(indices[::per_device], *inputs)
 
 
 def rows_on_devices(
@@ -268,11 +268,11 @@ def _devices_of(count):
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _one_each(work, fixed, devices, rows):
-    def one(share, rows):
+    def work_on_row(share, rows):
         return work(fixed, *jax.tree.map(lambda leaf: leaf[share], rows))
 
     mesh = None if devices == 1 else _local_mesh(devices)
-    return _on_mesh(one, devices, mesh, rows)
+    return _on_mesh(work_on_row, devices, mesh, rows)
 
 
 def shared(tree: PyTree, devices: int) -> PyTree:
@@ -297,11 +297,11 @@ def _on_each(tree, devices):
     mesh = _mesh(devices)
     sharding = NamedSharding(mesh, PartitionSpec())
 
-    def whole(leaf):
+    def replicate_leaf(leaf):
         copies = [jax.device_put(leaf, device) for device in mesh.local_devices]
         return jax.make_array_from_single_device_arrays(leaf.shape, sharding, copies)
 
-    return jax.tree.map(whole, tree)
+    return jax.tree.map(replicate_leaf, tree)
 
 
 def replicate(tree: PyTree, devices: int) -> PyTree:
@@ -352,13 +352,13 @@ def uncommitted(tree: PyTree) -> PyTree:
       The pytree with copies of the arrays. PRNG keys stay as they are.
     """
 
-    def copied(leaf):
+    def copy_leaf(leaf):
         is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         if is_key or not isinstance(leaf, jax.Array) or not leaf.committed:
             return leaf
         return jax.device_put(np.array(leaf, copy=True), may_alias=False)
 
-    return jax.tree.map(copied, tree)
+    return jax.tree.map(copy_leaf, tree)
 
 
 def _mesh(devices):

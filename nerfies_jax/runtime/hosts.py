@@ -64,8 +64,8 @@ def join(
       ValueError: If the launcher is not recognized, or the others cannot be reached.
     """
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    launched = open_mpi_address(os.environ) if coordinator is None else None
-    coordinator, processes, process, devices = launched or (
+    address = open_mpi_address(os.environ) if coordinator is None else None
+    coordinator, processes, process, devices = address or (
         *(coordinator, processes, process),
         None,
     )
@@ -335,11 +335,11 @@ def received_state(message: dict[str, Any], example: PyTree) -> PyTree:
         data = _broadcast(data)
     examples, structure = jax.tree.flatten(example)
     leaves, start = [], 0
-    for note, size, same in zip(notes, sizes, examples, strict=True):
+    for note, size, template in zip(notes, sizes, examples, strict=True):
         array = np.frombuffer(data[start : start + size], jnp.dtype(note["dtype"]))
         leaf = jnp.array(array.reshape(note["shape"]))
-        if _is_key(same):
-            leaf = jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(same))
+        if _is_key(template):
+            leaf = jax.random.wrap_key_data(leaf, impl=jax.random.key_impl(template))
         leaves.append(leaf)
         start += size
     return jax.tree.unflatten(structure, leaves)

@@ -80,12 +80,12 @@ class _Process:
         first = None
         while True:
             try:
-                received = self.reader.recv(16)
+                numbers = self.reader.recv(16)
             except TimeoutError:
-                received = b""
+                numbers = b""
             except OSError:  # closed as the process ends
                 return
-            for number in received:
+            for number in numbers:
                 if number not in self.before:
                     continue
                 self._request(number)
@@ -106,8 +106,8 @@ class _Process:
     def _is_over(self):
         with self.lock:
             start_time = max(self.request_time, self.unprotected_time)
-            elapsed = time.monotonic() - start_time
-            return not self.protections and elapsed > GRACE_SECONDS
+            duration = time.monotonic() - start_time
+            return not self.protections and duration > GRACE_SECONDS
 
     def _end(self):
         """End the process, whatever the main thread is doing."""
