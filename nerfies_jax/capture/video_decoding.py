@@ -206,9 +206,9 @@ def _shortfall(container, stream, count, last):
     )
 
 
-def _decode(av, container, stream, damaged):
+def _decode(av, container, stream, on_damage):
     """Decode frames. Unless damage is refused, skip those that cannot be decoded."""
-    if damaged == "refuse":
+    if on_damage == "refuse":
         yield from container.decode(stream)
         return
     packets = container.demux(stream)

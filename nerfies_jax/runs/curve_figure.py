@@ -50,9 +50,9 @@ def save(path: pathlib.Path, run: Run, trained: Trained, result: Result):
     return path
 
 
-def _is_partial(trained, result):
+def _is_partial(training, result):
     """Test if the curve covers fewer frames than the final metrics."""
-    return len(trained.watched) < result.frames
+    return len(training.watched) < result.frames
 
 
 def caption(run: Run, trained: Trained, result: Result) -> str:

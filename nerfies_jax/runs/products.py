@@ -208,10 +208,10 @@ def _capture_notes(run, folder):
     return dict.fromkeys([*run.capture.notes, *preprocessing, *run.observed.notes])
 
 
-def _frames_to_score(run: Run, trained: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
+def _frames_to_score(run: Run, training: Trained) -> tuple[np.ndarray, tuple[str, ...]]:
     """Select the held-out frames to evaluate."""
     heldout = run.capture.heldout
-    seconds = trained.renderer.ms_per_frame(1) / 1e3
+    seconds = training.renderer.ms_per_frame(1) / 1e3
     count = budget.scored_frames(seconds, len(heldout))
     if count == len(heldout):
         return heldout, ()
@@ -492,13 +492,13 @@ def save_depth(folder: pathlib.Path, capture: Capture, scored: Scored) -> None:
         exr.write_exr(folder / f"{name}.exr", alpha=alpha, depth=depth)
 
 
-def _next(folder, run, trained, base=None):
+def _next(folder, run, training, base=None):
     """Suggest the next commands, with absolute paths relative to a `base`."""
     line = commands.render(folder, run.code, base)
     render = report.Command("Render the scene from other viewpoints and times:", line)
-    if trained.result.stopped_by == "non-finite":
+    if training.result.stopped_by == "non-finite":
         return [render]  # a resumed run would stop at the same step
-    if trained.result.steps < run.spec.steps:
+    if training.result.steps < run.spec.steps:
         line = commands.resume(folder, run.code, base)
         return [render, report.Command("Continue training to the last step:", line)]
     overrides = tuple(o for o in run.config.overrides if not o.startswith("steps="))

@@ -353,20 +353,20 @@ def _open_checkpoints(stack, folder, run, state, after):
     return checkpoints
 
 
-def _hooks(stack, watched, run, folder):
+def _hooks(stack, observer, run, folder):
     """Return the hooks of observers, which stay active until `stack` is closed."""
-    return () if watched is None else (stack.enter_context(watched(run, folder)),)
+    return () if observer is None else (stack.enter_context(observer(run, folder)),)
 
 
 def _train(folder, run, start, pace, hooks, start_time, extra):
     """Train a run to its end and write its products."""
     with multiple_hosts.sharing(folder, run) as shared_run:
-        trained = train.train(shared_run, *start, pace, hooks)
-    result = trained.result
+        training = train.train(shared_run, *start, pace, hooks)
+    result = training.result
     errors = [result.unsaved] if result.unsaved else []
     if result.stopped_by in ("steps", "seconds", "non-finite"):
         try:
-            products.make(folder, run, trained, start_time, extra)
+            products.make(folder, run, training, start_time, extra)
         except FloatingPointError as error:
             errors.append(str(error))
         except (OSError, CaptureError) as error:

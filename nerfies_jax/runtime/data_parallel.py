@@ -267,9 +267,9 @@ def _devices_of(count):
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _one_each(work, fixed, devices, rows):
+def _one_each(work, static, devices, rows):
     def work_on_row(share, rows):
-        return work(fixed, *jax.tree.map(lambda leaf: leaf[share], rows))
+        return work(static, *jax.tree.map(lambda leaf: leaf[share], rows))
 
     mesh = None if devices == 1 else _local_mesh(devices)
     return _on_mesh(work_on_row, devices, mesh, rows)
