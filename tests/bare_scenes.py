@@ -224,7 +224,9 @@ def field_loss(spec, metadata, params, batch, key):
             middle = -jnp.sum(origin * direction)
             miss_sq = jnp.sum(jnp.square(origin + middle * direction))
             width = jnp.sqrt(spec.extent**2 + miss_sq)
-            distance = sampling.centered(first, near, far, plan.coarse, middle, width)
+            distance = sampling.sample_around(
+                first, near, far, plan.coarse, middle, width
+            )
         else:
             distance = sampling.stratified(first, near, far, plan.coarse, plan.spacing)
         if plan.fine == 0:

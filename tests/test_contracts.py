@@ -67,7 +67,7 @@ EXCUSED = {
     **dict.fromkeys(["codes.init", "kan.init", "mlp.init", "mlp.init_layer"], "draws"),
     **dict.fromkeys(["template.init", "grids.init", "planes.init"], "draws"),
     "voxels.init": "zeros",
-    **dict.fromkeys(["template.raw_density", "template.colored"], "template.apply"),
+    **dict.fromkeys(["template.raw_density", "template.add_color"], "template.apply"),
     "template.color_offset": "template.apply",
     "grids.variation_at_random": "draws",
     **dict.fromkeys(["precision.at_least_float32", "precision.refuse_half"], "types"),
@@ -176,7 +176,7 @@ SETTINGS = {
     "compositing.intervals": {"last": 1e10},
     **{
         f"sampling.{name}": {"key": None, "count": 4}
-        for name in ("stratified", "sample_pdf", "refine", "centered")
+        for name in ("stratified", "sample_pdf", "refine", "sample_around")
     },
     "sampling.among": {"key": None, "count": 4, "empty": 0.05},
     **{

@@ -157,7 +157,7 @@ DISTANCE = Case(
 
 
 def _thin(x):
-    return compositing.thinned(x[0], x[1])[None]
+    return compositing.scale_opacity(x[0], x[1])[None]
 
 
 def _thinned_as_printed(x):

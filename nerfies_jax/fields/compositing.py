@@ -22,9 +22,9 @@ AT_INFINITY = 1e10
 # goes to the far end of the ray. Bounds its gradient by 1e3 times the length of the
 # ray.
 EMPTY_BELOW = 1e-3
-# Opacity up to which `thinned` uses log1p instead of a sum of logarithms. It is not
-# 1/2, because from 0.3 to 0.42 XLA's log1p of float64 has errors of up to 120 eps on a
-# CPU. Below they are less than one eps.
+# Opacity up to which `scale_opacity` uses log1p instead of a sum of logarithms. It is
+# not 1/2, because from 0.3 to 0.42 XLA's log1p of float64 has errors of up to 120 eps
+# on a CPU. Below they are less than one eps.
 THIN_BELOW = 0.25
 
 
@@ -81,9 +81,9 @@ def media_weights(
 
     Light reaches a sample through all media in front of it. At the sample each medium
     is treated as if it were alone, as for the transient objects of NeRF-W and, after
-    `thinned`, the blending of NSFF. If media overlap in a sample, their weights sum to
-    more than `weights` of their joint depth, at most by a factor of the number of
-    media. Opacity and distances are therefore computed from the joint depth
+    `scale_opacity`, the blending of NSFF. If media overlap in a sample, their weights
+    sum to more than `weights` of their joint depth, at most by a factor of the number
+    of media. Opacity and distances are therefore computed from the joint depth
     (`composite_media`).
 
     Args:
@@ -101,7 +101,7 @@ def media_weights(
 
 
 @at_least_float32
-def thinned(
+def scale_opacity(
     optical_depth: Float[Array, "*samples"], share_logit: Float[Array, "*samples"]
 ) -> Float[Array, "*samples"]:
     """Scale the opacity of samples: -log(1 - v (1 - exp(-d))) for v = sigmoid(l).

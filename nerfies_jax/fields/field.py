@@ -127,12 +127,12 @@ def field(
         condition = FrameCondition(time, frame_codes, step)
         return skipping.survey(Bound(spec, metadata, static_effects, params), condition)
 
-    def render_occupied(params, occupied, camera, time, codes, size, step):
+    def render_occupied(params, occupied_cells, camera, time, codes, size, step):
         bound, condition = bind(params), FrameCondition(time, codes, step)
         if not surveyed_once():
             visible_cells = skipping.shown_cells(bound, camera, size)
-            occupied = skipping.survey(bound, condition, visible_cells)
-        return skipping.draw(bound, occupied, camera, condition, size)
+            occupied_cells = skipping.survey(bound, condition, visible_cells)
+        return skipping.draw(bound, occupied_cells, camera, condition, size)
 
     return Field(
         spec,
@@ -227,23 +227,23 @@ def _init(spec, metadata, effects, key):
     condition = sum(e.condition_width + e.surface_width for e in effects)
     nets = {}
     keys = jax.random.split(key, 3)
-    for number, (name, one) in enumerate(specs.templates_of(spec).items()):
+    for number, (name, net_spec) in enumerate(specs.templates_of(spec).items()):
         component_key = jax.random.fold_in(keys[0], number)
-        if not isinstance(one, template.TemplateSpec):
-            nets[name] = one.init(component_key, ambient_width, condition)
+        if not isinstance(net_spec, template.TemplateSpec):
+            nets[name] = net_spec.init(component_key, ambient_width, condition)
             continue
-        extras = 0 if one.direction is None else one.direction.width(3)
+        extras = 0 if net_spec.direction is None else net_spec.direction.width(3)
         nets[name] = template.init(
-            one,
+            net_spec,
             component_key,
-            one.encoded_width + ambient_width,
+            net_spec.encoded_width + ambient_width,
             condition + extras,
         )
     rows = {TIMESTAMP: len(metadata.times)}
-    learned = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
+    appearances = 1 + max((max(left, right) for left, right, _ in metadata.exposures))
     params = {"template": nets, "codes": {}}
     for table in specs.tables_of(effects):
-        count = rows.get(table.by, learned)
+        count = rows.get(table.by, appearances)
         params["codes"][table.name] = codes.init(
             jax.random.fold_in(keys[1], stream(table.name)), count, table.width
         )

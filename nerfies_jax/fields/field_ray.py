@@ -115,7 +115,9 @@ def first_distances(
         middle = -jnp.sum(ray.origin * ray.direction)
         miss_sq = jnp.sum(jnp.square(ray.origin + middle * ray.direction))
         width = jnp.sqrt(spec.extent**2 + miss_sq)
-        return sampling.centered(key, ray.near, ray.far, plan.coarse, middle, width)
+        return sampling.sample_around(
+            key, ray.near, ray.far, plan.coarse, middle, width
+        )
     if guide is None:
         return sampling.stratified(key, ray.near, ray.far, plan.coarse, plan.spacing)
     assert spec.extent is not None

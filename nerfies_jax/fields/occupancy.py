@@ -99,53 +99,53 @@ def corners(
 
 def _contract_back(share, half_side):
     """Convert positions in [0, 1] over the grid to units of the field."""
-    contracted = REACH * (2 * share - 1)
-    size = jnp.max(jnp.abs(contracted), axis=-1, keepdims=True)
+    coordinates = REACH * (2 * share - 1)
+    size = jnp.max(jnp.abs(coordinates), axis=-1, keepdims=True)
     # Inverse of (2 - 1 / |x|) x / |x|, which exists because REACH is below 2.
     distance = 1 / (jnp.maximum(size, 1) * (2 - jnp.maximum(size, 1)))
-    return half_side * contracted * distance
+    return half_side * coordinates * distance
 
 
-def dilated(occupied: Cells) -> Cells:
+def dilate(grid: Cells) -> Cells:
     """Add all cells that touch an occupied cell at a face, an edge or a corner.
 
     Args:
-      occupied: Occupied cells, [cells, cells, cells].
+      grid: Occupied cells, [cells, cells, cells].
 
     Returns:
       The enlarged set of cells.
     """
     window = (3, 3, 3)
     return jax.lax.reduce_window(
-        occupied, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME"
+        grid, False, jax.lax.bitwise_or, window, (1, 1, 1), "SAME"
     )
 
 
 def at(
-    occupied: Cells, point: Float[Array, "*points 3"], half_side: float
+    grid: Cells, point: Float[Array, "*points 3"], half_side: float
 ) -> Bool[Array, "*points"]:
     """Look up points in the occupancy grid.
 
     Args:
-      occupied: Occupied cells, [cells, cells, cells].
+      grid: Occupied cells, [cells, cells, cells].
       point: Points in units of the field, [..., 3].
       half_side: Half side of the box in units of the field.
 
     Returns:
       Booleans [...], True in an occupied cell or outside of the grid.
     """
-    cells = occupied.shape[0]
+    cells = grid.shape[0]
     # Coordinates are separate arrays, because arrays of points take twice the time.
-    scaled = [point[..., axis] / half_side for axis in range(3)]
-    beyond = functools.reduce(jnp.maximum, [jnp.abs(along) for along in scaled])
+    coordinates = [point[..., axis] / half_side for axis in range(3)]
+    beyond = functools.reduce(jnp.maximum, [jnp.abs(along) for along in coordinates])
     beyond = jnp.maximum(beyond, 1)
-    shrunk = (2 - 1 / beyond) / beyond
+    contraction = (2 - 1 / beyond) / beyond
     place = [
-        jnp.floor((along * shrunk / REACH + 1) * (cells / 2)).astype(jnp.int32)
-        for along in scaled
+        jnp.floor((along * contraction / REACH + 1) * (cells / 2)).astype(jnp.int32)
+        for along in coordinates
     ]
     inside = functools.reduce(
         jnp.logical_and, [(cell >= 0) & (cell < cells) for cell in place]
     )
     nearest = tuple(jnp.clip(cell, 0, cells - 1) for cell in place)
-    return ~inside | occupied[nearest]
+    return ~inside | grid[nearest]

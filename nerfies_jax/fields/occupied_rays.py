@@ -83,21 +83,21 @@ def _occupied_cells(field, params, step):
     return field.survey(params, step)[skipping.GUIDE]
 
 
-def meets(occupied: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
+def meets(grid: Cells, ray: Ray, half_side: float) -> Bool[Array, ""]:
     """Return whether a ray meets an occupied cell, or leaves the grid.
 
     Args:
-      occupied: Occupied cells.
+      grid: Occupied cells.
       ray: The ray in units of the field.
       half_side: Half side of the grid in units of the field.
 
     Returns:
       A boolean scalar.
     """
-    return jnp.any(filled_along(occupied, ray, half_side))
+    return jnp.any(filled_along(grid, ray, half_side))
 
 
-def chosen(
+def choose(
     meeting: Bool[Array, " candidates"], count: int, anywhere: int
 ) -> Int[Array, " count"]:
     """Choose the rays of a step: the first `anywhere`, then those that meet a cell.
@@ -116,12 +116,12 @@ def chosen(
     return jnp.concatenate([jnp.arange(anywhere), anywhere + order])
 
 
-def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
+def learned_from(field: Field, grid: Cells, candidates: Batch) -> Batch:
     """Choose the rays of a step from candidates.
 
     Args:
       field: The field.
-      occupied: Occupied cells.
+      grid: Occupied cells.
       candidates: `OccupancySpec.candidates` times as many rays as a step has.
 
     Returns:
@@ -133,7 +133,7 @@ def learned_from(field: Field, occupied: Cells, candidates: Batch) -> Batch:
     lines = jax.vmap(functools.partial(field_ray, field.metadata))(
         candidates.origin, candidates.direction, candidates.cosine
     )
-    meeting = jax.vmap(lambda ray: meets(occupied, ray, extent))(lines)
+    meeting = jax.vmap(lambda ray: meets(grid, ray, extent))(lines)
     count = len(meeting) // spec.candidates
-    rows = chosen(meeting & candidates.valid, count, round(spec.anywhere * count))
+    rows = choose(meeting & candidates.valid, count, round(spec.anywhere * count))
     return jax.tree.map(lambda leaf: leaf[rows], candidates)

@@ -105,8 +105,10 @@ def mean_flow(
     assert medium.share is not None  # a scene flow has a blending weight
     dynamic = (jax.nn.sigmoid(medium.share) * medium.density)[0]
     static = (jax.nn.sigmoid(-medium.share) * radiance.density)[0]
-    occupied = dynamic + static > 0
-    weight = jnp.where(occupied, dynamic / jnp.where(occupied, dynamic + static, 1), 0)
+    is_occupied = dynamic + static > 0
+    weight = jnp.where(
+        is_occupied, dynamic / jnp.where(is_occupied, dynamic + static, 1), 0
+    )
     names = ("flow_forward", "flow_backward")
     return weight * jnp.stack([medium.extras[name][0] for name in names])
 
@@ -148,15 +150,15 @@ def template_coordinates(
     Returns:
       The displaced point [3], and the features of each effect that adds coordinates.
     """
-    warped, condition = point, _with_point_codes(bound, point, condition)
+    canonical_point, condition = point, _with_point_codes(bound, point, condition)
     if any(effect.displace is not None for effect in bound.effects):
-        warped = point + _displacement(bound, point, condition)
+        canonical_point = point + _displacement(bound, point, condition)
     features = tuple(
         effect.trunk_features(bound.own(effect), point, condition)
         for effect in bound.effects
         if effect.trunk_features is not None
     )
-    return warped, features
+    return canonical_point, features
 
 
 def _samples(bound, ray, condition, distance):
@@ -286,20 +288,20 @@ def radiance_at(
     Returns:
       Density and color.
     """
-    warped, extra = place
+    canonical_point, extra = place
     spec, params = template_of(bound.spec, name), bound.params["template"][name]
     if not isinstance(spec, TemplateSpec):
-        features = jnp.concatenate([*extra, jnp.zeros(0, warped.dtype)])
+        features = jnp.concatenate([*extra, jnp.zeros(0, canonical_point.dtype)])
         inputs = TemplateInputs(
-            warped, offset[:3], features, offset[3:], condition.step
+            canonical_point, offset[:3], features, offset[3:], condition.step
         )
         density, color = spec.apply(params, inputs)
-        return template.Radiance(density, color, jnp.zeros(0, warped.dtype))
-    encoded = template.encode(spec, params, warped, condition.step)
-    features = jnp.concatenate([encoded, *extra])
+        return template.Radiance(density, color, jnp.zeros(0, canonical_point.dtype))
+    point_features = template.encode(spec, params, canonical_point, condition.step)
+    features = jnp.concatenate([point_features, *extra])
     raw, hidden = template.raw_density(spec, params, features)
     raw = raw if noise is None else raw + noise
-    return template.colored(spec, params, raw, hidden, offset)
+    return template.add_color(spec, params, raw, hidden, offset)
 
 
 def _radiance(bound, name, ray, condition, samples, noise):
@@ -307,8 +309,8 @@ def _radiance(bound, name, ray, condition, samples, noise):
     offset = color_offset(bound, name, ray.direction, condition)
     surfaces = [effect for effect in bound.effects if effect.surface is not None]
 
-    def evaluate(point, warped, extra, noise):
-        place = warped, extra
+    def evaluate(point, canonical_point, extra, noise):
+        place = canonical_point, extra
         if surfaces:
             sample = point, place, offset
             return _surface_at(bound, name, surfaces, sample, condition, noise)
@@ -321,17 +323,19 @@ def _radiance(bound, name, ray, condition, samples, noise):
 
 def _surface_at(bound, name, surfaces, sample, condition, noise):
     """Evaluate `radiance_at` with the outputs of surface effects as inputs of color."""
-    point, (warped, extra), offset = sample
+    point, (canonical_point, extra), offset = sample
     spec, params = template_of(bound.spec, name), bound.params["template"][name]
 
-    def density(params, warped, extra):
-        encoded = template.encode(spec, params, warped, condition.step)
-        return template.raw_density(spec, params, jnp.concatenate([encoded, *extra]))
+    def density(params, canonical_point, extra):
+        point_features = template.encode(spec, params, canonical_point, condition.step)
+        return template.raw_density(
+            spec, params, jnp.concatenate([point_features, *extra])
+        )
 
-    raw, hidden = density(params, warped, extra)
+    raw, hidden = density(params, canonical_point, extra)
     frozen = dataclasses.replace(bound, params=jax.lax.stop_gradient(bound.params))
-    frozen_params, frozen_warped, frozen_extra, frozen_point = jax.lax.stop_gradient(
-        (params, warped, extra, point)
+    frozen_params, frozen_canonical, frozen_extra, frozen_point = jax.lax.stop_gradient(
+        (params, canonical_point, extra, point)
     )
 
     def observed_normal(normal):
@@ -345,16 +349,16 @@ def _surface_at(bound, name, surfaces, sample, condition, noise):
         def raw_at(position):
             return density(frozen_params, position, frozen_extra)[0]
 
-        return -jax.grad(raw_at)(frozen_warped)
+        return -jax.grad(raw_at)(frozen_canonical)
 
     surface = Surface(point, hidden, observed_normal, template_normal)
     outputs = {
         effect.name: effect.surface(bound.own(effect), name, surface, condition)
         for effect in surfaces
     }
-    more = jnp.concatenate([output.features for output in outputs.values()])
+    surface_features = jnp.concatenate([output.features for output in outputs.values()])
     raw = raw if noise is None else raw + noise
-    radiance = template.colored(spec, params, raw, hidden, offset, more)
+    radiance = template.add_color(spec, params, raw, hidden, offset, surface_features)
     return radiance, {name: output.values for name, output in outputs.items()}
 
 
@@ -374,8 +378,10 @@ def _media(bound, effects, ray, condition, samples, radiance) -> dict[str, Mediu
 def _composite(bound, ray, samples, radiance, media):
     distance = samples.distance
     background = bound.metadata.background
-    captured = compositing.intervals(distance, jnp.maximum(ray.far - distance[-1], 0))
-    spacing = captured
+    finite_spacing = compositing.intervals(
+        distance, jnp.maximum(ray.far - distance[-1], 0)
+    )
+    spacing = finite_spacing
     if background is None:
         spacing = compositing.intervals(distance, compositing.AT_INFINITY)
     else:
@@ -385,10 +391,10 @@ def _composite(bound, ray, samples, radiance, media):
         if medium.share is None:
             # It ends at the far plane. Over the interval behind it any density would be
             # opaque, at almost no price: transient objects would explain the sky.
-            depth = medium.density * captured
+            depth = medium.density * finite_spacing
         else:
-            depth = compositing.thinned(medium.density * spacing, medium.share)
-            static = compositing.thinned(static, -medium.share)
+            depth = compositing.scale_opacity(medium.density * spacing, medium.share)
+            static = compositing.scale_opacity(static, -medium.share)
         of_media.append(depth)
     if media:
         depths = jnp.stack([static, *of_media])

@@ -172,9 +172,9 @@ def composite(
     finite = jnp.minimum(density, jnp.finfo(density.dtype).max)
     weights = compositing.weights(finite * interval)
     # Sums of products, because a GPU may round matrix products to ten bits.
-    rendered = jnp.sum(weights[:, None] * color, axis=0)
+    ray_color = jnp.sum(weights[:, None] * color, axis=0)
     alpha = jnp.sum(weights)
     if background is not None:
-        rendered = rendered + (1 - alpha) * background
+        ray_color = ray_color + (1 - alpha) * background
     depth = compositing.expected_distance(weights, t, t[-1])
-    return Rendered(rendered, depth, weights, alpha)
+    return Rendered(ray_color, depth, weights, alpha)

@@ -76,7 +76,7 @@ def stratified(
     return jnp.minimum(lower + (upper - lower) * jitter, upper)
 
 
-def centered(
+def sample_around(
     key: Key[Array, ""] | None,
     near: Float[Array, ""],
     far: Float[Array, ""],
@@ -122,7 +122,7 @@ def among(
     key: Key[Array, ""] | None,
     near: Float[Array, ""],
     far: Float[Array, ""],
-    filled: Bool[Array, " bins"],
+    is_occupied: Bool[Array, " bins"],
     count: int,
     empty: float,
 ) -> Float[Array, " count"]:
@@ -135,16 +135,16 @@ def among(
       key: PRNG key, or None.
       near: Distance at which the ray begins.
       far: Distance at which it ends.
-      filled: True for occupied bins, which have equal lengths, [bins].
+      is_occupied: True for occupied bins, which have equal lengths, [bins].
       count: Number of samples.
       empty: Density of samples in an empty bin, relative to an occupied one.
 
     Returns:
       Sorted distances, [count].
     """
-    share = jnp.linspace(0, 1, filled.shape[0] + 1, dtype=near.dtype)
+    share = jnp.linspace(0, 1, is_occupied.shape[0] + 1, dtype=near.dtype)
     edges = jnp.clip(near + (far - near) * share, near, far)
-    weights = jnp.where(filled, jnp.ones((), near.dtype), empty)
+    weights = jnp.where(is_occupied, jnp.ones((), near.dtype), empty)
     return sample_pdf(key, edges, weights, count)
 
 
@@ -202,15 +202,15 @@ def sample_pdf(
         weights, _ = near_one(jnp.where(faint, 1, weights))
         weights = weights / jnp.max(weights)
         floor = float(limits.eps)
-    cumulated = jnp.cumsum(weights + floor)
-    cumulated = jnp.concatenate([jnp.zeros_like(cumulated[:1]), cumulated])
-    cumulated = jax.lax.optimization_barrier(cumulated)
+    cumsum = jnp.cumsum(weights + floor)
+    cumsum = jnp.concatenate([jnp.zeros_like(cumsum[:1]), cumsum])
+    cumsum = jax.lax.optimization_barrier(cumsum)
     # The last sum is 1 only up to rounding, so the values to invert are scaled.
-    reached = _shares(key, count, weights.dtype) * cumulated[-1]
-    bin_ = jax.lax.optimization_barrier(_last_not_above(cumulated[:-1], reached))
-    start, width = cumulated[bin_], cumulated[bin_ + 1] - cumulated[bin_]
+    targets = _shares(key, count, weights.dtype) * cumsum[-1]
+    bin_ = jax.lax.optimization_barrier(_last_not_above(cumsum[:-1], targets))
+    start, width = cumsum[bin_], cumsum[bin_ + 1] - cumsum[bin_]
     # If rounding absorbs a floor in the cumulative sum, the bin has no width.
-    within = jnp.clip((reached - start) / jnp.where(width > 0, width, 1), 0, 1)
+    within = jnp.clip((targets - start) / jnp.where(width > 0, width, 1), 0, 1)
     left, right = edges[bin_], edges[bin_ + 1]
     return jnp.minimum(left + within * (right - left), right).astype(dtype)
 
@@ -227,8 +227,8 @@ def union(
     Returns:
       Sorted distances, [coarse + fine].
     """
-    combined = jnp.concatenate([coarse, fine])
-    return jnp.zeros_like(combined).at[merged_places(coarse, fine)].set(combined)
+    distances = jnp.concatenate([coarse, fine])
+    return jnp.zeros_like(distances).at[merged_places(coarse, fine)].set(distances)
 
 
 def merged_places(

@@ -107,14 +107,14 @@ def survey(
     cells = _cells_across(bound)
     to_evaluate = jnp.ones(cells**3, bool)
     if visible is not None:
-        to_evaluate = occupancy.dilated(visible).ravel()
+        to_evaluate = occupancy.dilate(visible).ravel()
     span = (metadata.far - metadata.near) * metadata.scale
     names = tuple(bound.params["template"])
     dtype = jax.tree.leaves(bound.params["template"])[0].dtype
     direction = jnp.zeros(3, dtype).at[2].set(1)  # density does not depend on it
     offset = {n: color_offset(bound, n, direction, condition) for n in names}
 
-    def add_look(occupied, number):
+    def add_look(occupied_cells, number):
         key = jax.random.fold_in(jax.random.key(0), number)
 
         def densities(point):
@@ -130,19 +130,19 @@ def survey(
             lambda cell: jax.vmap(densities)(point[cell]), to_evaluate
         )
         above = {name: new * span > SKIPPED_DEPTH for name, new in density.items()}
-        if guided:
+        if has_guide:
             most = functools.reduce(jnp.maximum, density.values())
             above[GUIDE] = most * span > GUIDE_DEPTH
-        return jax.tree.map(jnp.logical_or, occupied, above), None
+        return jax.tree.map(jnp.logical_or, occupied_cells, above), None
 
-    guided = spec.sampling.occupancy is not None
-    kinds = (*names, GUIDE) if guided else names
+    has_guide = spec.sampling.occupancy is not None
+    kinds = (*names, GUIDE) if has_guide else names
     start = {name: jnp.zeros(cells**3, bool) for name in kinds}
     occupancy_of, _ = jax.lax.scan(add_look, start, jnp.arange(LOOKS, dtype=jnp.int32))
-    whole = (cells,) * 3
+    shape = (cells,) * 3
     return {
-        name: occupancy.dilated(occupied.reshape(whole)) | ~to_evaluate.reshape(whole)
-        for name, occupied in occupancy_of.items()
+        name: occupancy.dilate(grid.reshape(shape)) | ~to_evaluate.reshape(shape)
+        for name, grid in occupancy_of.items()
     }
 
 
@@ -197,7 +197,7 @@ def shown_cells(bound: Bound, camera: Camera, size: tuple[int, int]) -> occupanc
 
 def draw(
     bound: Bound,
-    occupied: Occupancy,
+    occupied_cells: Occupancy,
     camera: Camera,
     condition: FrameCondition,
     size: tuple[int, int],
@@ -206,7 +206,7 @@ def draw(
 
     Args:
       bound: The field with its parameters.
-      occupied: Occupied cells from `survey`.
+      occupied_cells: Occupied cells from `survey`.
       camera: The camera.
       condition: Conditioning of the frame.
       size: Width and height of the image in pixels.
@@ -228,7 +228,7 @@ def draw(
         columns = None
         if grid is not None:
             columns = jax.vmap(lambda at: frustum_grid.column(grid, at, size))(position)
-        return _block(bound, occupied, camera, condition, position, columns)
+        return _block(bound, occupied_cells, camera, condition, position, columns)
 
     renderings = jax.lax.map(render_block, centers.reshape(blocks, block, 2))
     return jax.tree.map(
@@ -239,13 +239,13 @@ def draw(
     )
 
 
-def _block(bound, occupied, camera, condition, position, columns):
+def _block(bound, occupied_cells, camera, condition, position, columns):
     """Render the rays of some pixels, with columns of a displacement grid or None."""
     plan, behind = bound.spec.sampling, bound.metadata.background
     ray, cosine = jax.vmap(lambda p: field_ray_through(bound.metadata, camera, p))(
         position
     )
-    guide = occupied.get(GUIDE)
+    guide = occupied_cells.get(GUIDE)
     distance = jax.vmap(lambda ray: first_distances(bound.spec, ray, None, guide))(ray)
 
     def spacing_of(distance, far):
@@ -259,30 +259,30 @@ def _block(bound, occupied, camera, condition, position, columns):
         displacement = None
         if columns is not None:
             displacement = jax.vmap(frustum_grid.along)(columns, ray, distance)
-        inputs = name, occupied[name], ray, condition
-        answer, evaluated = _evaluate(
+        inputs = name, occupied_cells[name], ray, condition
+        answer, cache = _evaluate(
             bound, *inputs, distance, spacing, values, before, displacement
         )
-        return answer[..., 0] * spacing, answer[..., 1:], evaluated
+        return answer[..., 0] * spacing, answer[..., 1:], cache
 
     before = None
     if plan.fine:
-        depth, _, evaluated = evaluate("fine" if plan.shared else "coarse", distance, 1)
+        depth, _, cache = evaluate("fine" if plan.shared else "coarse", distance, 1)
 
-        def refined(distance, depth, evaluated):
+        def refine_distances(distance, depth, cache):
             weights = compositing.weights(depth)
             fine = sampling.refine(None, distance, weights, plan.fine)
-            merged = fine_distances(bound.spec, bound.metadata, distance, fine)
-            if evaluated is None or not plan.union:
-                return merged, None
+            union = fine_distances(bound.spec, bound.metadata, distance, fine)
+            if cache is None or not plan.union:
+                return union, None
             place = sampling.merged_places(distance, fine)[: plan.coarse]
 
             def scatter(x):
-                return jnp.zeros((len(merged), *x.shape[1:]), x.dtype).at[place].set(x)
+                return jnp.zeros((len(union), *x.shape[1:]), x.dtype).at[place].set(x)
 
-            return merged, jax.tree.map(scatter, evaluated)
+            return union, jax.tree.map(scatter, cache)
 
-        distance, before = jax.vmap(refined)(distance, depth, evaluated)
+        distance, before = jax.vmap(refine_distances)(distance, depth, cache)
     depth, color, _ = evaluate("fine", distance, 4, before)
     background = None if behind is None else jnp.asarray(behind, distance.dtype)
     composite = jax.vmap(
@@ -294,7 +294,7 @@ def _block(bound, occupied, camera, condition, position, columns):
     return Rendering(composite.color, composite.alpha, z_depth)
 
 
-class _Evaluated(NamedTuple):
+class _Coordinates(NamedTuple):
     """Coordinates at which the template was evaluated, zero for skipped samples."""
 
     known: Bool[Array, "rays samples"]
@@ -304,7 +304,7 @@ class _Evaluated(NamedTuple):
 def _evaluate(
     bound,
     name,
-    occupied,
+    occupied_cells,
     ray,
     condition,
     distance,
@@ -323,18 +323,18 @@ def _evaluate(
     point = ray.origin[:, None] + distance[..., None] * ray.direction[:, None]
     if displacement is not None:
         point = point + displacement
-    mask = occupancy.at(occupied, point, bound.spec.extent)
+    mask = occupancy.at(occupied_cells, point, bound.spec.extent)
     if bound.metadata.background is None:
         mask = mask.at[:, -1].set(True)  # it represents everything behind it
     offset = jax.vmap(lambda d: color_offset(bound, name, d, condition))(ray.direction)
     width = -(-samples // STAGES)  # samples of a stage
 
-    def staged(x):
+    def split_stages(x):
         padding = ((0, 0), (0, STAGES * width - samples), *[(0, 0)] * (x.ndim - 2))
         x = jnp.pad(x, padding).reshape(count, STAGES, width, *x.shape[2:])
         return jnp.moveaxis(x, 1, 0)
 
-    def whole(x):
+    def join_stages(x):
         x = jnp.moveaxis(x.reshape(STAGES, count, width, *x.shape[2:]), 0, 1)
         return x.reshape(count, STAGES * width, *x.shape[3:])[:, :samples]
 
@@ -366,24 +366,25 @@ def _evaluate(
                 return values_at(index, place), place if is_kept else None
 
             answer, place = _evaluate_compactly(jax.vmap(evaluate_new), mask)
-            evaluated = _Evaluated(mask, place) if is_kept else None
+            cache = _Coordinates(mask, place) if is_kept else None
         else:
-            more = _evaluate_compactly(jax.vmap(place_of), mask & ~before.known)
-            place = jax.tree.map(jnp.add, before.place, more)  # one of them is zero
+            new_place = _evaluate_compactly(jax.vmap(place_of), mask & ~before.known)
+            # For each sample one of them is zero.
+            place = jax.tree.map(jnp.add, before.place, new_place)
 
             def evaluate_known(index):
                 return values_at(index, jax.tree.map(lambda x: x[index], place))
 
-            answer, evaluated = (
+            answer, cache = (
                 _evaluate_compactly(jax.vmap(evaluate_known), mask),
                 None,
             )
         depth = answer[:, 0].reshape(spacing.shape) * spacing
-        return passed_depth + jnp.sum(depth, axis=1), (answer, evaluated)
+        return passed_depth + jnp.sum(depth, axis=1), (answer, cache)
 
-    inputs = jax.tree.map(staged, (spacing, mask, distance, before, displacement))
+    inputs = jax.tree.map(split_stages, (spacing, mask, distance, before, displacement))
     _, results = jax.lax.scan(stage, jnp.zeros(count, distance.dtype), inputs)
-    return jax.tree.map(whole, results)
+    return jax.tree.map(join_stages, results)
 
 
 def _evaluate_compactly(
@@ -394,16 +395,16 @@ def _evaluate_compactly(
     order = jnp.cumsum(mask, dtype=jnp.int32)
     rows = math.ceil(places / BATCH) * BATCH
     slot = jnp.where(mask, order - 1, rows)
-    listed = jnp.zeros(rows, jnp.int32)
-    listed = listed.at[slot].set(jnp.arange(places, dtype=jnp.int32), mode="drop")
+    indices = jnp.zeros(rows, jnp.int32)
+    indices = indices.at[slot].set(jnp.arange(places, dtype=jnp.int32), mode="drop")
 
-    def unfinished(state):
+    def has_more(state):
         return state[0] * BATCH < order[-1]
 
     def batch(state):
         number, answers = state
         start = number * BATCH
-        place = jax.lax.dynamic_slice(listed, (start,), (BATCH,))
+        place = jax.lax.dynamic_slice(indices, (start,), (BATCH,))
         valid = start + jnp.arange(BATCH, dtype=jnp.int32) < order[-1]
         row = jnp.where(valid, place, places)
         answers = jax.tree.map(
@@ -415,4 +416,4 @@ def _evaluate_compactly(
 
     shapes = jax.eval_shape(function, jnp.zeros(BATCH, jnp.int32))
     start = jax.tree.map(lambda x: jnp.zeros((places, *x.shape[1:]), x.dtype), shapes)
-    return jax.lax.while_loop(unfinished, batch, (jnp.zeros((), jnp.int32), start))[1]
+    return jax.lax.while_loop(has_more, batch, (jnp.zeros((), jnp.int32), start))[1]

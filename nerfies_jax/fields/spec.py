@@ -202,8 +202,8 @@ class RadianceScene:
                 "a mask of what moves guides a warp, and there is none that reads it; "
                 "set warp=WarpSpec or mask=none"
             )
-        flow, guided = self.scene_flow, self.sampling.occupancy is not None
-        if flow is not None and flow.moving_rays is not None and guided:
+        flow, has_guide = self.scene_flow, self.sampling.occupancy is not None
+        if flow is not None and flow.moving_rays is not None and has_guide:
             raise ValueError(
                 f"scene_flow.moving_rays={flow.moving_rays} chooses rays, and so does "
                 "sampling.occupancy; set one of them to none"
@@ -272,10 +272,10 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
         # The warp is fitted with all bands open. Closing them would undo the fit.
         warp_spec = dataclasses.replace(warp_spec, anneal_steps=None)
     if spec.mask is not None and isinstance(warp_spec, WarpSpec):
-        warp_spec = guided(warp_spec)
+        warp_spec = add_guide(warp_spec)
     if spec.mask is not None and slice_ is not None:
-        slice_ = guided(slice_)
-    built = (
+        slice_ = add_guide(slice_)
+    parts = (
         (spec.appearance, conditioning),
         (spec.transient, medium),
         (spec.time, conditioning),
@@ -291,7 +291,7 @@ def effects_of(spec: RadianceScene, metadata: SceneMetadata) -> tuple[FieldRecor
         *((one, conditioning) for one in spec.conditioning),
         *((one, regularizer) for one in spec.regularizers),
     )
-    return tuple(make(one) for one, make in built if one is not None)
+    return tuple(make(one) for one, make in parts if one is not None)
 
 
 def optimizer_of(spec: RadianceScene) -> Optimizer:
@@ -310,18 +310,18 @@ def optimizer_of(spec: RadianceScene) -> Optimizer:
 GuidedT = TypeVar("GuidedT", WarpSpec, AmbientSpec)
 
 
-def guided(one: GuidedT) -> GuidedT:
+def add_guide(spec: GuidedT) -> GuidedT:
     """Add the mask of moving points to the guides of a warp or ambient surface.
 
     Args:
-      one: Settings, or None.
+      spec: Settings, or None.
 
     Returns:
       The changed settings.
     """
-    if moving_mask.NAME in one.guides:
-        return one
-    return dataclasses.replace(one, guides=(*one.guides, moving_mask.NAME))
+    if moving_mask.NAME in spec.guides:
+        return spec
+    return dataclasses.replace(spec, guides=(*spec.guides, moving_mask.NAME))
 
 
 def tables_of(effects: tuple[FieldRecord, ...]) -> tuple[Table, ...]:

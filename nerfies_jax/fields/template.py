@@ -276,7 +276,7 @@ def apply(
     raw, hidden = raw_density(spec, params, features)
     if density_noise is not None:
         raw = raw + density_noise
-    return colored(spec, params, raw, hidden, color_offset(spec, params, condition))
+    return add_color(spec, params, raw, hidden, color_offset(spec, params, condition))
 
 
 def color_offset(
@@ -301,7 +301,7 @@ def color_offset(
     )
 
 
-def colored(
+def add_color(
     spec: TemplateSpec,
     params: Template,
     raw: Float[Array, ""],

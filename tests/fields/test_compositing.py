@@ -15,7 +15,7 @@ weights_of = jax.jit(compositing.weights)
 many_weights = jax.jit(jax.vmap(compositing.weights))
 media_weights_of = jax.jit(compositing.media_weights)
 composite_media = jax.jit(compositing.composite_media)
-thinned = jax.jit(compositing.thinned)
+scale_opacity = jax.jit(compositing.scale_opacity)
 median_indices = jax.jit(jax.vmap(compositing.median_index))
 
 
@@ -35,7 +35,7 @@ def exact_weights(optical_depth):
     return np.array(rows)
 
 
-def exact_thinned(depth, logit):
+def exact_scale_opacity(depth, logit):
     with mpmath.workdps(60 + int(abs(logit))):
         share = 1 / (1 + mpmath.exp(-mpmath.mpf(float(logit))))
         opacity = 1 - mpmath.exp(-mpmath.mpf(float(depth)))
@@ -95,11 +95,11 @@ def test_infinite_spacing_and_depth_have_finite_values_and_slopes(dtype):
     assert np.all(np.isfinite(grads))
 
 
-def test_weights_and_thinned_have_the_slopes_of_central_differences(float64, rng):
+def test_weights_and_opacities_have_the_slopes_of_central_differences(float64, rng):
     cotangent, logit = jnp.asarray(rng.normal(size=12)), rng.normal(size=12)
 
     def total(depth, logit):
-        thin = jnp.sum(jnp.sin(compositing.thinned(depth, logit)))
+        thin = jnp.sum(jnp.sin(compositing.scale_opacity(depth, logit)))
         return jnp.vdot(compositing.weights(depth), cotangent) + thin
 
     assert gradients.directional_error(total, rng.uniform(0, 1, 12), logit) < 1e-7
@@ -132,12 +132,12 @@ def test_media_composite_term_by_term(float64, rng):
 
 
 @pytest.mark.hard_cases
-def test_thinned_keeps_its_digits_at_any_opacity(dtype):
+def test_scale_opacity_keeps_its_digits_at_any_opacity(dtype):
     """XLA's log1p of float64 loses 120 eps about -0.41."""
     depth, logit = np.meshgrid([0.3, 1.0, 8.0], np.linspace(-2, 2, 41))
     depth, logit = depth.astype(dtype).ravel(), logit.astype(dtype).ravel()
-    exact = [exact_thinned(*pair) for pair in zip(depth, logit, strict=True)]
-    thin = np.asarray(thinned(depth, logit), np.float64)
+    exact = [exact_scale_opacity(*pair) for pair in zip(depth, logit, strict=True)]
+    thin = np.asarray(scale_opacity(depth, logit), np.float64)
     # twice what was measured
     np.testing.assert_allclose(thin, exact, rtol=6 * np.finfo(dtype).eps)
 

@@ -41,7 +41,7 @@ meets = jax.jit(occupied_rays.meets, static_argnums=2)
 @pytest.mark.parametrize("anywhere", [0, 7])
 def test_rays_that_meet_something_come_first_and_others_fill_up(rng, share, anywhere):
     meeting = rng.random(60) < share
-    actual = np.asarray(occupied_rays.chosen(jnp.asarray(meeting), 20, anywhere))
+    actual = np.asarray(occupied_rays.choose(jnp.asarray(meeting), 20, anywhere))
     rest = range(anywhere, 60)
     wanted = [*(n for n in rest if meeting[n]), *(n for n in rest if not meeting[n])]
     assert actual.tolist() == [*range(anywhere), *wanted][:20]

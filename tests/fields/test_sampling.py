@@ -325,7 +325,7 @@ def test_centered_samples_have_the_density_of_the_documentation(near, dtype):
     start, far, middle, width = ends
 
     def at(key):
-        return sampling.centered(key, start, far, 33, middle, width)
+        return sampling.sample_around(key, start, far, 33, middle, width)
 
     even = np.asarray(at(None), float)
     # Equal integrals of the density between neighbors.

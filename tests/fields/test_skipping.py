@@ -194,7 +194,7 @@ def test_a_survey_finds_a_small_thing_whichever_cell_it_is_in():
     cells = 12
     index = np.arange(cells**3, dtype=np.int32)
     draw = jax.jit(occupancy.random_points, static_argnums=(2, 3, 4))
-    dilated = jax.jit(occupancy.dilated)
+    dilated = jax.jit(occupancy.dilate)
     for number in range(3):
         point = draw(jax.random.key(number), index, cells, 0.3, jnp.float32)
         assert np.abs(point).max() > 0.5  # up to twice the half-side
@@ -245,7 +245,7 @@ def test_a_survey_of_what_is_shown_is_that_of_everything_there(bend):
         jax.jit(lambda which: skipping.survey(bound, condition, which))(which)
         for which in (None, shown)
     )
-    around = np.asarray(jax.jit(occupancy.dilated)(shown))
+    around = np.asarray(jax.jit(occupancy.dilate)(shown))
     shown = np.asarray(shown)
     for name, cells in whole.items():
         actual = np.asarray(part[name])

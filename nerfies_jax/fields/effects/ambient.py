@@ -203,9 +203,9 @@ def ambient_point(
     """
     if spec.kind == "plane":
         return condition.codes[PLANE_TABLE]
-    encoded = encoding.encode(spec.position, point, None)
+    point_features = encoding.encode(spec.position, point, None)
     guides = guides_of(spec.guides, condition)
-    inputs = jnp.concatenate([encoded, condition.codes[spec.table], *guides])
+    inputs = jnp.concatenate([point_features, condition.codes[spec.table], *guides])
     assert params is not None  # a bent surface has parameters
     return mlp.apply(network(spec), params, inputs)["ambient"]
 

@@ -74,10 +74,10 @@ class ElasticSpec:
 
     def loss(self, params: PyTree, context: PenaltyContext) -> dict[str, Term]:
         """Compute the elastic energy of the warp at the coarse samples of a step."""
-        value, folded = energy_of_step(self, context)
-        planned = schedule(self)
-        weight = planned(context.step) if callable(planned) else planned
-        return {"elastic": Term(value, weight), "folded": Term(folded, None)}
+        value, fold_fraction = energy_of_step(self, context)
+        schedule_ = schedule(self)
+        weight = schedule_(context.step) if callable(schedule_) else schedule_
+        return {"elastic": Term(value, weight), "folded": Term(fold_fraction, None)}
 
 
 def schedule(spec: ElasticSpec) -> schedules.Schedule | float:
@@ -113,8 +113,8 @@ def energy_of_step(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, 
     zero = jnp.zeros((), context.levels[0].point.dtype)
 
     def evaluate():
-        value, folded = energy(spec, context)
-        return spec.every * value, spec.every * folded
+        value, fold_fraction = energy(spec, context)
+        return spec.every * value, spec.every * fold_fraction
 
     return jax.lax.cond(context.step % spec.every == 0, evaluate, lambda: (zero, zero))
 
@@ -181,13 +181,13 @@ def energy(spec: ElasticSpec, context: PenaltyContext) -> tuple[Scalar, Scalar]:
 
     def cost_at(point, condition):
         jacobian = jax.jacfwd(lambda x: context.displace(x, condition))(point)
-        folded = displacement_determinant(jax.lax.stop_gradient(jacobian)) < 0
-        return displacement_cost(spec, jacobian), folded.astype(point.dtype)
+        is_fold = displacement_determinant(jax.lax.stop_gradient(jacobian)) < 0
+        return displacement_cost(spec, jacobian), is_fold.astype(point.dtype)
 
-    costs, folded = jax.vmap(jax.vmap(cost_at, (0, None)))(point, context.condition)
+    costs, folds = jax.vmap(jax.vmap(cost_at, (0, None)))(point, context.condition)
     total = jnp.sum(weight)
-    folded_fraction = jnp.sum(weight * folded) / jnp.where(total > 0, total, 1)
-    return jnp.mean(jnp.sum(weight * costs, axis=-1)), folded_fraction
+    fold_fraction = jnp.sum(weight * folds) / jnp.where(total > 0, total, 1)
+    return jnp.mean(jnp.sum(weight * costs, axis=-1)), fold_fraction
 
 
 def draw(
@@ -233,12 +233,12 @@ def systematic(
     Returns:
       Indices of samples and the weight that each represents, [draws].
     """
-    cumulated = jnp.cumsum(weight)
-    total = cumulated[-1]
+    cumsum = jnp.cumsum(weight)
+    total = cumsum[-1]
     positions = (start + jnp.arange(draws, dtype=weight.dtype)) * (total / draws)
     # With side="right" a position of zero skips leading samples of weight zero.
-    index = jnp.searchsorted(cumulated, positions, side="right", method="compare_all")
+    index = jnp.searchsorted(cumsum, positions, side="right", method="compare_all")
     # A position that was rounded up to the total must not choose a trailing sample of
     # weight zero.
-    index = jnp.minimum(index, jnp.sum(cumulated < total, dtype=index.dtype))
+    index = jnp.minimum(index, jnp.sum(cumsum < total, dtype=index.dtype))
     return index, jnp.full(draws, total / draws, weight.dtype)

@@ -60,13 +60,13 @@ def elastic_loss(
     )
 
     def displacement(point):
-        warped = warp(point)
-        if jnp.shape(warped) != (3,):
+        warped_point = warp(point)
+        if jnp.shape(warped_point) != (3,):
             raise ValueError(
-                f"elastic_loss: `warp` returns {list(jnp.shape(warped))} for one point "
-                "[3], expected [3]; `warp` must take a single point"
+                f"elastic_loss: `warp` returns {list(jnp.shape(warped_point))} for one "
+                "point [3], expected [3]; `warp` must take a single point"
             )
-        return warped - point
+        return warped_point - point
 
     def energy(point):
         return elastic.displacement_cost(spec, jax.jacfwd(displacement)(point))

@@ -138,8 +138,8 @@ def share(
     Returns:
       A scalar in (0, 1).
     """
-    encoded = encoding.encode(spec.position, point, None)
-    inputs = jnp.concatenate([encoded, condition.codes[spec.table]])
+    features = encoding.encode(spec.position, point, None)
+    inputs = jnp.concatenate([features, condition.codes[spec.table]])
     logit = mlp.apply(network(spec), params, inputs)["logit"][0]
     # Near one the gradient of a sigmoid rounds to zero, and a certain but wrong
     # prediction could not be corrected. The complement keeps its gradient.

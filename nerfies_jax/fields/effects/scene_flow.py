@@ -359,11 +359,11 @@ def _along_rays(spec, params, point, direction, time):
         return dynamic(spec, params, point, direction, time)
 
     # Nested, because the samples of a ray share its direction and time.
-    nested = jax.vmap(jax.vmap(evaluate, (0, None, None)))
-    return nested(point, direction, time)
+    evaluate_rays = jax.vmap(jax.vmap(evaluate, (0, None, None)))
+    return evaluate_rays(point, direction, time)
 
 
-def chained(
+def chain_error(
     spec: SceneFlowSpec,
     times: tuple[float, ...] | Float[Array, " times"],
     params: SceneFlow,
@@ -431,7 +431,7 @@ def penalty(
             jnp.square(_medium_color(level, weight, medium.color) - batch.color), mask
         ),
         "warped": lambda: total(
-            flow_losses.warped(
+            flow_losses.warp_error(
                 one.color,
                 batch.color,
                 one.weight,
@@ -466,7 +466,7 @@ def penalty(
     if spec.chain_steps is not None and spec.weights.warped > 0:
         error = jax.lax.cond(
             context.step >= spec.chain_steps,
-            lambda: chained(spec, times, params, context, sides, mask),
+            lambda: chain_error(spec, times, params, context, sides, mask),
             lambda: jnp.zeros((), mask.dtype),
         )
         terms["chain"] = Term(error, spec.weights.warped)
@@ -506,11 +506,11 @@ def _depth_term(
     batch, level = context.batch, context.levels[-1]
     assert context.frames is not None
     image_row = context.frames.image_row(batch.row)
-    captured = _pixels(context.frames.depths, image_row, batch.pixel)
+    target = _pixels(context.frames.depths, image_row, batch.pixel)
     distance = flow_losses.expected_value(weight, level.distances[..., None])[..., 0]
-    predicted = distance * batch.cosine / context.box.scale
+    depth = distance * batch.cosine / context.box.scale
     return flow_losses.normalized_depth(
-        predicted, captured.astype(predicted.dtype), batch.valid & (captured > 0)
+        depth, target.astype(depth.dtype), batch.valid & (target > 0)
     )
 
 
@@ -536,23 +536,25 @@ def _flow_term(
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, visible, rows) in zip(SIGNS, sides, pairs, strict=True):
         other = rows[batch.row].astype(batch.row.dtype)
-        elapsed = sign * (frames.times[other] - context.condition.time) / gap
-        point = level.point + elapsed[:, None, None] * one.flow
-        expected = flow_losses.expected_value(weight, point) / context.box.scale
+        intervals = sign * (frames.times[other] - context.condition.time) / gap
+        point = level.point + intervals[:, None, None] * one.flow
+        mean_point = flow_losses.expected_value(weight, point) / context.box.scale
         camera = cameras.take(frames.cameras, other)
-        pixel, depth = jax.vmap(cameras.project)(camera, expected + context.box.center)
+        pixel, depth = jax.vmap(cameras.project)(
+            camera, mean_point + context.box.center
+        )
         target = batch.pixel + _pixels(shift, batch.row, batch.pixel).astype(
             pixel.dtype
         )
-        counted = (
+        valid = (
             _pixels(visible, batch.row, batch.pixel)
             & (other != batch.row)
             & batch.valid
             & one.present
             & (depth > 0)
         )
-        error = jnp.where(counted[:, None], pixel - target, 0)
-        total = total + flow_losses.mean_where(jnp.abs(error), counted)
+        error = jnp.where(valid[:, None], pixel - target, 0)
+        total = total + flow_losses.mean_where(jnp.abs(error), valid)
     return total
 
 

@@ -55,10 +55,10 @@ def weighted_mean(
     # are scaled to about one, because the gradient of a quotient has the square of the
     # divisor. In float32 it is 0 if all weights are below 1e-19.
     is_zero = jnp.max(weight) <= FAINTEST
-    scaled, _ = near_one(jnp.where(is_zero, 1, weight))
-    scaled = jnp.where(is_zero, 0, scaled)
-    total = jnp.where(is_zero, 1, jnp.sum(scaled))
-    return jnp.sum(scaled * jnp.mean(values, axis=-1)) / total
+    scaled_weight, _ = near_one(jnp.where(is_zero, 1, weight))
+    scaled_weight = jnp.where(is_zero, 0, scaled_weight)
+    total = jnp.where(is_zero, 1, jnp.sum(scaled_weight))
+    return jnp.sum(scaled_weight * jnp.mean(values, axis=-1)) / total
 
 
 def mean_where(
@@ -76,7 +76,7 @@ def mean_where(
     return weighted_mean(values, present.astype(values.dtype))
 
 
-def warped(
+def warp_error(
     color: Float[Array, "rays 3"],
     target: Float[Array, "rays 3"],
     weight: Float[Array, "rays samples"],
@@ -143,8 +143,8 @@ def magnitude(
     Returns:
       A scalar.
     """
-    fixed = jax.lax.stop_gradient(weight)[..., None]
-    return mean_where(jnp.abs(jnp.sum(fixed * flow, axis=-2)), present)
+    frozen_weight = jax.lax.stop_gradient(weight)[..., None]
+    return mean_where(jnp.abs(jnp.sum(frozen_weight * flow, axis=-2)), present)
 
 
 def smoothness(
@@ -235,18 +235,18 @@ def expected_value(
 
 
 def normalized_depth(
-    predicted: Float[Array, " rays"],
+    depth: Float[Array, " rays"],
     target: Float[Array, " rays"],
-    known: Bool[Array, " rays"],
+    valid: Bool[Array, " rays"],
 ) -> Scalar:
     """Compute the squared difference of depths normalized by median and deviation.
 
     It is invariant to scale and offset, like monocular depth.
 
     Args:
-      predicted: Rendered depths, [rays].
+      depth: Rendered depths, [rays].
       target: Depths of the capture, [rays].
-      known: True where the depth is known, [rays].
+      valid: True where the depth is known, [rays].
 
     Returns:
       The error, zero with fewer than two known depths.
@@ -254,17 +254,17 @@ def normalized_depth(
     References:
       Ranftl et al. 2020, arXiv:1907.01341, equation 5.
     """
-    enough = jnp.sum(known) > 1
-    known = known & enough
-    difference = _normalize(predicted, known) - _normalize(target, known)
-    return mean_where(jnp.square(difference)[:, None], known)
+    enough = jnp.sum(valid) > 1
+    valid = valid & enough
+    difference = _normalize(depth, valid) - _normalize(target, valid)
+    return mean_where(jnp.square(difference)[:, None], valid)
 
 
 def _normalize(depth, valid):
     """Normalize by median and mean deviation, with gradients. Unknown depths give 0."""
     count = jnp.sum(valid)
-    ordered = jnp.sort(jnp.where(valid, depth, jnp.inf))
-    median = ordered[jnp.maximum((count - 1) // 2, 0)]
+    sorted_depth = jnp.sort(jnp.where(valid, depth, jnp.inf))
+    median = sorted_depth[jnp.maximum((count - 1) // 2, 0)]
     offset = jnp.where(valid, depth - jnp.where(count > 0, median, 0), 0)
     spread = mean_where(jnp.abs(offset)[:, None], valid)
     least = FLATTEST * jnp.abs(jax.lax.stop_gradient(jnp.where(count > 0, median, 1)))

@@ -139,10 +139,10 @@ def evaluate(
     # No gradient to the trunk: the gradients of the normal losses emptied the scene
     # within 60 steps of a small run.
     head = mlp.affine(params[level], jax.lax.stop_gradient(surface.features))
-    observed = unit(surface.observed_normal(unit(head)))
+    observed_normal = unit(surface.observed_normal(unit(head)))
     # No gradient from color to normals, which would otherwise fit color.
-    fixed_normal = jax.lax.stop_gradient(observed)
-    encoded = [
+    fixed_normal = jax.lax.stop_gradient(observed_normal)
+    features = [
         encoding.encode(spec_, value, window(spec, spec_, condition.step, value))
         for spec_, value in (
             (spec.position, surface.point),
@@ -151,10 +151,10 @@ def evaluate(
     ]
     values = {
         "head": head,
-        "observed": observed,
+        "observed": observed_normal,
         "slope": unit(surface.template_normal()),
     }
-    return SurfaceOutput(jnp.concatenate(encoded), values)
+    return SurfaceOutput(jnp.concatenate(features), values)
 
 
 def window(
@@ -198,9 +198,9 @@ def unit(vector: Vector) -> Vector:
     nonzero = largest > 0
     # The gradient with respect to the scale is zero, so it need not be computed.
     largest = jax.lax.stop_gradient(jnp.where(nonzero, largest, 1))
-    scaled = jnp.where(nonzero, vector, 1) / largest
-    length = jnp.sqrt(jnp.sum(scaled**2))
-    return jnp.where(nonzero, scaled / length, 0)
+    scaled_vector = jnp.where(nonzero, vector, 1) / largest
+    length = jnp.sqrt(jnp.sum(scaled_vector**2))
+    return jnp.where(nonzero, scaled_vector / length, 0)
 
 
 def penalty(spec: SurfaceSpec, _, context: PenaltyContext) -> dict[str, Term]:

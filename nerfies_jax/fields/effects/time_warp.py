@@ -115,8 +115,8 @@ def _embed(
     spec: TimeWarpSpec, params: TimeWarp, time: Scalar
 ) -> Float[Array, " embedding"]:
     """Embed a time."""
-    encoded = encoding.encode(spec.time, time[None], None)
-    return mlp.apply(_time_network(spec), params.time, encoded)["embedding"]
+    time_features = encoding.encode(spec.time, time[None], None)
+    return mlp.apply(_time_network(spec), params.time, time_features)["embedding"]
 
 
 def displace(
@@ -138,8 +138,8 @@ def displace(
     # once.
     embedding = _embed(spec, params, condition.time)
     at_time = mlp.with_known(network, params.shift, embedding)
-    encoded = encoding.encode(spec.position, point, None)
-    return mlp.apply(network, at_time, encoded)["linear"]
+    point_features = encoding.encode(spec.position, point, None)
+    return mlp.apply(network, at_time, point_features)["linear"]
 
 
 def features(
@@ -156,5 +156,5 @@ def features(
     Returns:
       The encoded observed point and the embedding of the time, [features].
     """
-    encoded = encoding.encode(spec.position, point, None)
-    return jnp.concatenate([encoded, _embed(spec, params, condition.time)])
+    point_features = encoding.encode(spec.position, point, None)
+    return jnp.concatenate([point_features, _embed(spec, params, condition.time)])

@@ -42,5 +42,5 @@ def neighbor(
     index = jnp.searchsorted(midpoints, time) + sign
     present = (index >= 0) & (index < len(times))
     nearest = timestamps[jnp.clip(index, 0, len(times) - 1)]
-    extrapolated = time + sign * interval(len(times))
-    return jnp.where(present, nearest, extrapolated), present
+    extrapolation = time + sign * interval(len(times))
+    return jnp.where(present, nearest, extrapolation), present

@@ -245,8 +245,8 @@ def photometric(
         truth = jnp.where(valid[..., None], truth, 0)
         beta = jnp.where(valid, beta, 1)
     # Divided first, so that the square of a residual far below beta does not underflow.
-    scaled = (color - truth) / beta[..., None]
-    each = jnp.sum(jnp.square(scaled), axis=-1) / 2 + jnp.log(beta)
+    residual = (color - truth) / beta[..., None]
+    each = jnp.sum(jnp.square(residual), axis=-1) / 2 + jnp.log(beta)
     if beta_power:
         each = each * jax.lax.stop_gradient(beta) ** beta_power
     return losses.masked_mean(each[..., None], valid)
@@ -268,6 +268,6 @@ def penalty(spec: TransientSpec, context: PenaltyContext) -> dict[str, Term]:
     """
     level = context.levels[-1]
     value = losses.masked_mean(level.media[NAME].density, context.batch.valid)
-    explained = jnp.sum(level.media_weight[NAME], axis=-1)
-    share = losses.masked_mean(explained[..., None], context.batch.valid)
+    opacity = jnp.sum(level.media_weight[NAME], axis=-1)
+    share = losses.masked_mean(opacity[..., None], context.batch.valid)
     return {"density": Term(value, spec.density_weight), "share": Term(share, None)}

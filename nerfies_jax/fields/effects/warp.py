@@ -163,13 +163,15 @@ def displace(
     Returns:
       Template point minus observed point in units of the field, [3].
     """
-    encoded = encoding.encode(spec.position, point, window(spec, condition.step, point))
+    features = encoding.encode(
+        spec.position, point, window(spec, condition.step, point)
+    )
     guides = guides_of(spec.guides, condition)
     if spec.condition == "code":
         code = jnp.concatenate([condition.codes[spec.table], *guides])
-        return _move(spec, params, point, encoded, code)
+        return _move(spec, params, point, features, code)
     time = encoding.encode(spec.time, condition.time[None], None)
-    shift = _move(spec, params, point, encoded, jnp.concatenate([time, *guides]))
+    shift = _move(spec, params, point, features, jnp.concatenate([time, *guides]))
     return jnp.where(condition.time == 0, 0, shift)
 
 
@@ -193,27 +195,27 @@ def window(
     return schedules.band_window(bands, spec.anneal_steps, step, like.dtype)
 
 
-def _move(spec, params, point, encoded, condition):
-    hidden = _features(spec, params, encoded, condition)
+def _move(spec, params, point, features, condition):
+    hidden = _features(spec, params, features, condition)
     screw = {name: mlp.affine(head, hidden) for name, head in params.heads.items()}
     if spec.kind == "translation":
         return screw["linear"]
     return lie.displacement(screw["angular"], screw["linear"], point)
 
 
-def _features(spec, params, encoded, condition):
-    """Evaluate `mlp.hidden_features` of [encoded, condition].
+def _features(spec, params, features, condition):
+    """Evaluate `mlp.hidden_features` of [features, condition].
 
     The contribution of the condition is computed separately: once per ray under vmap
     over samples, and without tangents in forward mode.
     """
     if not params.hidden:  # the heads read both
-        return jnp.concatenate([encoded, condition])
+        return jnp.concatenate([features, condition])
     activation = mlp.ACTIVATIONS[network(spec).activation]
-    hidden = encoded
+    hidden = features
     for index, layer in enumerate(params.hidden):
         if index in spec.skips:
-            hidden = jnp.concatenate([hidden, encoded])
+            hidden = jnp.concatenate([hidden, features])
         if index == 0 or index in spec.skips:
             of_hidden, of_condition = jnp.split(layer.weight, [hidden.shape[-1]])
             offset = condition @ of_condition + layer.bias

@@ -124,7 +124,7 @@ def test_slopes_are_those_of_differences(float64, rng):
 
     def total(flow, back, seen, color, depth, through):
         return (
-            10 * flow_losses.warped(color, target, weight, seen, mask)
+            10 * flow_losses.warp_error(color, target, weight, seen, mask)
             + flow_losses.cycle(flow, back, seen, present)
             + 10 * flow_losses.magnitude(flow, weight, present)
             + flow_losses.smoothness(flow, present)
