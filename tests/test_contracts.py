@@ -127,7 +127,7 @@ SETTINGS = {
             map(jnp.asarray, _network(functools.partial(grids.init, _GRID))(dtype))
         ),
     },
-    "grids.unit_place": {"half_side": 1.0, "contracted": True},
+    "grids.unit_place": {"half_side": 1.0, "is_contracted": True},
     "voxels.encode": {
         "spec": VoxelGridSpec(cells=2, features=2, strides=(2, 1), bands=1),
         "tables": lambda dtype: (
@@ -327,7 +327,7 @@ REACH = {
     **dict.fromkeys(["planes.total_variation", "planes.time_smoothness"], 0.45),
     "planes.features": 0.45,
     "entropy.bits": 0.45,  # over a deviation as small as e^-12
-    **dict.fromkeys(["entropy.rounded", "faces.gaussians"], 0.9),  # in steps; lengths
+    **dict.fromkeys(["entropy.quantize", "faces.gaussians"], 0.9),  # in steps; lengths
     # sums of more than four, or multiples
     **dict.fromkeys(["codes.blend", "encoding.encode", "losses.l1"], 0.9),
     "encoding.positional_encoding": 0.9,

@@ -301,10 +301,10 @@ def quantize(features: Features, law: Law, spec: AnchorMotionSpec) -> Features:
     """
     step, residual_step = _steps(law)
     reference = _straight_through(
-        features.reference, entropy.rounded(features.reference, law.mean, step)
+        features.reference, entropy.quantize(features.reference, law.mean, step)
     )
     mean, _ = _law_of_residual(law, spec, reference)
-    quantized = entropy.rounded(features.residual, mean, residual_step)
+    quantized = entropy.quantize(features.residual, mean, residual_step)
     return Features(reference, _straight_through(features.residual, quantized))
 
 

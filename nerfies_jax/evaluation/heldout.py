@@ -301,7 +301,7 @@ def _cameras(estimate, capture, exact):
     true = cameras.take(capture.cameras, estimate.scored.rows)
     if exact and len(estimate.scored.rows) > 1:
         path = geometry_quality.path_errors(
-            estimate.cameras.position, true.position, scaled=False
+            estimate.cameras.position, true.position, with_scale=False
         )
         if path.alignment.determined:
             numbers["cameras.ate"] = path.rmse

@@ -247,24 +247,24 @@ def cost(function: Callable, *args, **kwargs) -> Cost:
     """
     start = time.perf_counter()
     lower = function.lower if hasattr(function, "lower") else jax.jit(function).lower
-    compiled = lower(*args, **kwargs).compile()
-    return cost_of(compiled, time.perf_counter() - start)
+    program = lower(*args, **kwargs).compile()
+    return cost_of(program, time.perf_counter() - start)
 
 
-def cost_of(compiled: jax.stages.Compiled, compile_seconds: float) -> Cost:
+def cost_of(program: jax.stages.Compiled, compile_seconds: float) -> Cost:
     """Return the cost of a call of a compiled program.
 
     Args:
-      compiled: The program.
+      program: The compiled program.
       compile_seconds: Time of its compilation.
 
     Returns:
       The cost.
     """
-    analysis = compiled.cost_analysis() or {}
+    analysis = program.cost_analysis() or {}
     if isinstance(analysis, list):  # one per computation on some backends
         analysis = analysis[0] if analysis else {}
-    memory = compiled.memory_analysis()
+    memory = program.memory_analysis()
     if memory is None:
         raise ValueError("this backend does not report the memory of its programs")
     return Cost(

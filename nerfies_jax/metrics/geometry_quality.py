@@ -127,11 +127,11 @@ def align_depth(
     covariance = _mean(from_mean * (truth - mean_truth), valid)
     # The mean has an error of a few ulps, which is the variance of a constant depth.
     rounding = 4 * jnp.finfo(depth.dtype).eps * mean_depth
-    determined = variance > rounding**2
+    is_determined = variance > rounding**2
     scale = jnp.where(
-        determined, covariance / jnp.where(determined, variance, 1.0), 0.0
+        is_determined, covariance / jnp.where(is_determined, variance, 1.0), 0.0
     )
-    return Line(scale, mean_truth - scale * mean_depth, determined)
+    return Line(scale, mean_truth - scale * mean_depth, is_determined)
 
 
 class FlowErrors(NamedTuple):
@@ -257,7 +257,7 @@ class RelativeErrors(NamedTuple):
     rotation_deg: float  # mean angle
 
 
-def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similarity:
+def align_points(points: np.ndarray, truth: np.ndarray, with_scale: bool) -> Similarity:
     """Find the similarity or rigid motion that aligns points with their truth.
 
     The rotation is not determined by points on a line, which `determined` reports (the
@@ -267,7 +267,7 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
     Args:
       points: Points, [points, 3].
       truth: Their true positions, [points, 3].
-      scaled: True for a similarity, False for a rigid motion.
+      with_scale: True for a similarity, False for a rigid motion.
 
     Returns:
       The alignment.
@@ -289,17 +289,17 @@ def align_points(points: np.ndarray, truth: np.ndarray, scaled: bool) -> Similar
     center, true_center = points.mean(0), truth.mean(0)
     offsets, true_offsets = points - center, truth - true_center
     left, spread, right = np.linalg.svd(true_offsets.T @ offsets / len(points))
-    mirrored = np.linalg.det(left) * np.linalg.det(right) < 0
-    signs = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
+    is_mirrored = np.linalg.det(left) * np.linalg.det(right) < 0
+    signs = np.array([1.0, 1.0, -1.0 if is_mirrored else 1.0])
     rotation = left * signs @ right
     variance = np.mean(np.sum(offsets**2, axis=1))
     largest = max(np.abs(points).max(), np.finfo(float).tiny)
     spread_out = variance > (FLAT_BELOW * largest) ** 2
     rank = min(_rank(points), _rank(truth))
-    scale = float(spread @ signs / variance) if scaled and spread_out else 1.0
+    scale = float(spread @ signs / variance) if with_scale and spread_out else 1.0
     # If the two smallest singular values of a mirrored set are equal, the axis of the
     # flip is not determined.
-    ambiguous = mirrored and spread[1] - spread[2] <= FLAT_BELOW * spread[0]
+    ambiguous = is_mirrored and spread[1] - spread[2] <= FLAT_BELOW * spread[0]
     return Similarity(
         scale=scale,
         rotation=rotation,
@@ -317,7 +317,7 @@ def _rank(points):
 
 
 def path_errors(
-    positions: np.ndarray, truth: np.ndarray, scaled: bool = True
+    positions: np.ndarray, truth: np.ndarray, with_scale: bool = True
 ) -> PathErrors:
     """Compute the absolute trajectory error of camera positions after alignment.
 
@@ -326,7 +326,7 @@ def path_errors(
     Args:
       positions: Camera positions, [frames, 3].
       truth: True positions, [frames, 3].
-      scaled: True to align the scale too, which images alone do not determine.
+      with_scale: True to align the scale too, which images alone do not determine.
 
     Returns:
       The errors.
@@ -334,9 +334,9 @@ def path_errors(
     References:
       Sturm et al. 2012.
     """
-    alignment = align_points(positions, truth, scaled)
-    aligned = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
-    distance = np.linalg.norm(aligned + alignment.translation - truth, axis=1)
+    alignment = align_points(positions, truth, with_scale)
+    estimate = alignment.scale * np.asarray(positions, float) @ alignment.rotation.T
+    distance = np.linalg.norm(estimate + alignment.translation - truth, axis=1)
     return PathErrors(
         rmse=float(np.sqrt(np.mean(distance**2))),
         median=float(np.median(distance)),

@@ -252,9 +252,9 @@ def masked_ssim(
 
     luminance, contrast = _terms(image, truth, mean)
     radius = losses.RADIUS
-    centered = mask[radius:-radius, radius:-radius, None]
-    total = jnp.sum(jnp.where(centered, luminance * contrast, 0.0))
-    return total / (jnp.sum(centered).astype(image.dtype) * image.shape[-1])
+    center_mask = mask[radius:-radius, radius:-radius, None]
+    total = jnp.sum(jnp.where(center_mask, luminance * contrast, 0.0))
+    return total / (jnp.sum(center_mask).astype(image.dtype) * image.shape[-1])
 
 
 @checked(broadcast=True, images=("image", "truth"))
@@ -293,10 +293,10 @@ def partial_ssim(
         for axis in (1, 0):
             slide = jax.vmap(_window_sum, (1 - axis, None), 1 - axis)
             share = slide(remaining, np.full(TAPS, 1 / TAPS))
-            met = share > 0.5 / TAPS  # at least one of eleven pixels
+            has_pixels = share > 0.5 / TAPS  # at least one of eleven pixels
             smooth = slide(x * remaining, np.array(losses.WINDOW))
-            x = jnp.where(met, smooth / jnp.where(met, share, 1.0), 0.0)
-            remaining = met.astype(x.dtype)
+            x = jnp.where(has_pixels, smooth / jnp.where(has_pixels, share, 1.0), 0.0)
+            remaining = has_pixels.astype(x.dtype)
         return x
 
     mean_image, mean_truth = mean(image), mean(truth)

@@ -69,10 +69,10 @@ def parts_ms(parts: Mapping[str, Part]) -> dict[str, float]:
 
 
 def _median_ms(one):
-    compiled = one.compiled.result()
+    program = one.compiled.result()
 
     def call():
-        return compiled(*one.args)
+        return program(*one.args)
 
     first = clock.measure(call, repeats=1, warm_up=0).median
     repeats = min(REPEATS, int(PART_SECONDS / first))

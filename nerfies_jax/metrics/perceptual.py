@@ -190,14 +190,14 @@ def masked_lpips(
 
 
 def features(
-    params: LpipsParams, network: Network, signed: Float[Array, "height width 3"]
+    params: LpipsParams, network: Network, image: Float[Array, "height width 3"]
 ) -> tuple[Float[Array, "rows columns channels"], ...]:
     """Compute the five compared feature maps of an image, after their ReLUs.
 
     Args:
       params: Trained weights.
       network: Their network.
-      signed: Image in [-1, 1], [height, width, 3].
+      image: Image in [-1, 1], [height, width, 3].
 
     Returns:
       Feature maps, [rows, columns, channels].
@@ -205,13 +205,13 @@ def features(
     Raises:
       ValueError: If the image is too small for the network.
     """
-    if min(signed.shape[:2]) < network.smallest:
+    if min(image.shape[:2]) < network.smallest:
         raise ValueError(
             f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
-            f"side, got {signed.shape[1]}x{signed.shape[0]}"
+            f"side, got {image.shape[1]}x{image.shape[0]}"
         )
-    shift, scale = (jnp.asarray(x, signed.dtype) for x in (SHIFT, SCALE))
-    x = ((signed - shift) / scale)[None]
+    shift, scale = (jnp.asarray(x, image.dtype) for x in (SHIFT, SCALE))
+    x = ((image - shift) / scale)[None]
     convolutions = iter(params.convolutions)
     outputs = []
     for stage in network.stages:
@@ -285,9 +285,9 @@ def load(network: Network, files: Iterable[str | pathlib.Path] = ()) -> LpipsPar
       WeightsMissing: If they cannot be found.
     """
     files, tensors = tuple(files), {}
-    installed = installed_weights(network)
-    if not files and installed is not None:
-        return _params(network, _from_flax(network, installed))
+    package_weights = installed_weights(network)
+    if not files and package_weights is not None:
+        return _params(network, _from_flax(network, package_weights))
     for path in files:
         tensors.update(weight_files.read_tensors(path))
     for part, names, fallback in (

@@ -134,14 +134,14 @@ def _read_torch_zip(path):
         order = folder + "byteorder"
         if order in archive.namelist() and archive.read(order) != b"little":
             raise ValueError("big-endian tensors")
-        pickled = archive.read(index)
+        pickle_bytes = archive.read(index)
 
     @functools.cache
     def read(key):
         with zipfile.ZipFile(path) as archive:
             return archive.read(f"{folder}data/{key}")
 
-    return _Unpickler(io.BytesIO(pickled), read).load()
+    return _Unpickler(io.BytesIO(pickle_bytes), read).load()
 
 
 def _read_torch_legacy(path):

@@ -89,11 +89,11 @@ def encode(
             "use the same number of bands for both"
         )
     powers = jnp.asarray([2.0**k for k in range(spec.bands)], point.dtype)
-    scaled = powers[:, None] * point  # exact; float16 would overflow
+    phase = powers[:, None] * point  # exact; float16 would overflow
     # The argument is reduced before the multiplication by π. Computed as sin(2^k π x)
     # in float32, the error is 1e-4 at k = 9, and the result is noise at |x| = 1e4.
     # Without π the product is exact.
-    sine, cosine = sincospi(scaled) if spec.times_pi else sincos(scaled)
+    sine, cosine = sincospi(phase) if spec.times_pi else sincos(phase)
     waves = jnp.stack([sine, cosine], axis=1)
     if window is not None:
         waves = waves * window[:, None, None]
@@ -120,9 +120,9 @@ def anneal(bands: int, alpha: Scalar) -> Float[Array, " bands"]:
     References:
       Park et al. 2021 (Nerfies), arXiv:2011.12948, equation 8.
     """
-    opened = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
+    fraction = jnp.clip(alpha - jnp.arange(bands, dtype=alpha.dtype), 0, 1)
     # The polynomial is exact at its ends: closed bands are 0 and open bands are 1.
-    return sincospi(opened / 2)[0] ** 2
+    return sincospi(fraction / 2)[0] ** 2
 
 
 @checked(broadcast=True)

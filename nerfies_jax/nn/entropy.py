@@ -43,7 +43,7 @@ def noisy(key: Key[Array, ""], values: Numbers, step: Numbers) -> Numbers:
     return values + noise.astype(values.dtype) * step
 
 
-def rounded(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
+def quantize(values: Numbers, mean: Numbers, step: Numbers) -> Numbers:
     """Round values to whole steps from the mean of their distribution.
 
     Args:

@@ -144,22 +144,22 @@ def encode(
 
 
 def unit_place(
-    point: Float[Array, "3"], half_side: float, contracted: bool
+    point: Float[Array, "3"], half_side: float, is_contracted: bool
 ) -> Float[Array, "3"]:
     """Map a point to [0, 1]^3 over the box, or over its contracted surroundings.
 
     Args:
       point: Point in units of the field, [3].
       half_side: Half side of the box in units of the field.
-      contracted: True to contract space, False to clamp to the box.
+      is_contracted: True to contract space, False to clamp to the box.
 
     Returns:
       The position in the unit cube, [3].
     """
-    scaled = point / half_side
-    if contracted:
-        return (contract(scaled) + 2) / 4
-    return (jnp.clip(scaled, -1, 1) + 1) / 2
+    coordinates = point / half_side
+    if is_contracted:
+        return (contract(coordinates) + 2) / 4
+    return (jnp.clip(coordinates, -1, 1) + 1) / 2
 
 
 def contract(point: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -227,8 +227,8 @@ def _between_vertices_jvp(cells, stride, primals, tangents):
     # frames of `d-nerf-grid-small` then take a tenth longer.
     nonzero = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
 
-    def product(*differentiated):
-        arguments = iter(differentiated)
+    def product(*inputs):
+        arguments = iter(inputs)
         table, place = (
             next(arguments) if flag else primal
             for flag, primal in zip(nonzero, primals, strict=True)
@@ -253,10 +253,10 @@ def _vertices_around(place, cells, stride, rows):
     Coordinates are separate scalars, because arrays of three take twice the time.
     """
     wide_cells = cells // stride
-    scaled = [x * wide_cells for x in place]
+    coordinates = [x * wide_cells for x in place]
     # The position 1 belongs to the last cell.
-    low = [jnp.clip(jnp.floor(x), 0, wide_cells - 1) for x in scaled]
-    fractions = [x - corner for x, corner in zip(scaled, low, strict=True)]
+    low = [jnp.clip(jnp.floor(x), 0, wide_cells - 1) for x in coordinates]
+    fractions = [x - corner for x, corner in zip(coordinates, low, strict=True)]
     axis_weights = [(1 - fraction, fraction) for fraction in fractions]
     corner = [x.astype(jnp.int32) for x in low]
     vertex_rows, weights = [], []

@@ -467,10 +467,10 @@ def standardize(
     # over its square would overflow otherwise.
     largest = jnp.max(jnp.abs(features), axis=-1, keepdims=True)
     scale = jnp.maximum(power_of_two(jax.lax.stop_gradient(largest)), 1)
-    scaled = features / scale
-    centered = scaled - jnp.mean(scaled, axis=-1, keepdims=True)
-    variance = jnp.mean(centered**2, axis=-1, keepdims=True)
-    return centered * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
+    scaled_features = features / scale
+    deviation = scaled_features - jnp.mean(scaled_features, axis=-1, keepdims=True)
+    variance = jnp.mean(deviation**2, axis=-1, keepdims=True)
+    return deviation * jax.lax.rsqrt(variance + NORM_VARIANCE / scale**2)
 
 
 @checked
@@ -514,8 +514,8 @@ def hold(
         inverse * jax.lax.rsqrt(3 + (2 + inverse) * inverse),
         jax.lax.rsqrt(1 + (2 + 3 * excess) * excess),
     )
-    clamped = middle + jnp.sign(offset) * (half + margin * (1 - remainder))
-    return jnp.where(outside, clamped, x)
+    clamped_x = middle + jnp.sign(offset) * (half + margin * (1 - remainder))
+    return jnp.where(outside, clamped_x, x)
 
 
 def _layer(spec, params, index):
@@ -524,8 +524,8 @@ def _layer(spec, params, index):
     if index < len(params.hidden):
         return params.hidden[index], kernels
     heads = [params.heads[name] for name, _ in spec.read_outs]
-    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *heads)
-    return joined, kernels
+    layer = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=-1), *heads)
+    return layer, kernels
 
 
 def _sum_over_inputs(spec, index, layer, kernels, inputs):
@@ -536,7 +536,7 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     margin = width(spec, index)
     if spec.basis == "rbf":
         margin /= math.sqrt(2)
-    clamped = hold(inputs, spec.grid_of(index), margin)
+    clamped_inputs = hold(inputs, spec.grid_of(index), margin)
     if kernels is None:
         center = centers(spec, index, dtype)
         per_width = jnp.asarray(1 / _kernel_widths(spec, index), dtype)
@@ -565,7 +565,7 @@ def _sum_over_inputs(spec, index, layer, kernels, inputs):
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def add_kernel(total, kernel):
         center, per_width, weight = kernel
-        distance = (clamped - center) * per_width
+        distance = (clamped_inputs - center) * per_width
         value = jnp.exp(-(distance**2)) if gaussian else bsplines.cubic(distance)
         return total + value @ weight, None
 

@@ -209,7 +209,7 @@ def affine(
     return dense.product(inputs, layer.weight) + layer.bias
 
 
-def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP:
+def with_known(spec: MLPSpec, params: MLP, known_inputs: Float[Array, " known"]) -> MLP:
     """Fold known inputs into the biases of a network.
 
     If the last inputs are the same for a whole batch, their contribution is computed
@@ -219,7 +219,7 @@ def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP
     Args:
       spec: Settings of the network with all inputs.
       params: Parameters from `init`.
-      known: Values of the last inputs, [known].
+      known_inputs: Values of the last inputs, [known].
 
     Returns:
       Parameters of a network of the other inputs.
@@ -228,8 +228,10 @@ def with_known(spec: MLPSpec, params: MLP, known: Float[Array, " known"]) -> MLP
     def fold(index, layer):
         if index != 0 and index not in spec.skips:
             return layer
-        weight = layer.weight[-len(known) :]
-        return Layer(layer.weight[: -len(known)], layer.bias + known @ weight)
+        weight = layer.weight[-len(known_inputs) :]
+        return Layer(
+            layer.weight[: -len(known_inputs)], layer.bias + known_inputs @ weight
+        )
 
     hidden = tuple(fold(*item) for item in enumerate(params.hidden))
     heads = params.heads

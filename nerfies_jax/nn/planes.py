@@ -159,7 +159,7 @@ def encode(
       Features, [levels * features].
     """
     spec.width(len(place))
-    encoded = space_features(spec, levels, place[:3])
+    encoding = space_features(spec, levels, place[:3])
     if spec.timestamps is not None:
         time, *axes = place[3], *place[:3]
         by_level = [
@@ -171,8 +171,8 @@ def encode(
         ]
         of_time = jnp.stack([_combine(spec, planes) for planes in by_level])
         inside = (time >= 0) & (time <= 1)
-        encoded = _refuse_outside(spec, _combine(spec, [encoded, of_time]), inside)
-    return encoded.reshape(-1)
+        encoding = _refuse_outside(spec, _combine(spec, [encoding, of_time]), inside)
+    return encoding.reshape(-1)
 
 
 def space_features(
@@ -196,8 +196,8 @@ def space_features(
         for level in levels
     ]
     inside = jnp.all((place >= 0) & (place <= 1))
-    encoded = jnp.stack([_combine(spec, planes) for planes in by_level])
-    return _refuse_outside(spec, encoded, inside)
+    encoding = jnp.stack([_combine(spec, planes) for planes in by_level])
+    return _refuse_outside(spec, encoding, inside)
 
 
 def at_time(levels: tuple[Level, ...], time: Float[Array, ""]) -> Lines:
@@ -361,10 +361,10 @@ def _cell(
     place: Float[Array, ""], vertices: int
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """Return the vertex before a position in [0, 1], and the fraction to the next."""
-    scaled = jnp.clip(place, 0, 1) * (vertices - 1)
+    coordinate = jnp.clip(place, 0, 1) * (vertices - 1)
     # The position 1 belongs to the last cell.
-    before = jnp.clip(jnp.floor(scaled), 0, vertices - 2)
-    return before.astype(jnp.int32), scaled - before
+    before = jnp.clip(jnp.floor(coordinate), 0, vertices - 2)
+    return before.astype(jnp.int32), coordinate - before
 
 
 def _combine(spec, parts):
@@ -374,7 +374,7 @@ def _combine(spec, parts):
     return total
 
 
-def _refuse_outside(spec, encoded, inside):
+def _refuse_outside(spec, encoding, inside):
     if spec.outside == "clamp":
-        return encoded
-    return jnp.where(inside, encoded, jnp.full_like(encoded, jnp.nan))
+        return encoding
+    return jnp.where(inside, encoding, jnp.full_like(encoding, jnp.nan))

@@ -188,7 +188,7 @@ def test_a_known_motion_comes_back_from_far_away(distance, rng):
     assert alignment.scale == pytest.approx(scale, rel=1e-8)
     np.testing.assert_allclose(alignment.rotation, rotation, atol=1e-8)
     assert alignment.determined
-    assert quality.path_errors(points, truth, scaled=False).rmse > 0.1
+    assert quality.path_errors(points, truth, with_scale=False).rmse > 0.1
     points[4] += 0.5
     errors = quality.path_errors(points, truth)
     assert 0 < errors.median < errors.rmse < errors.largest
