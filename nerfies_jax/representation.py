@@ -32,7 +32,7 @@ MOTION_PARTS = ("elastic", "background", "mask", "ambient", *MOTIONS)
 
 
 def advise(
-    wanted: dict[str, bool | None],
+    decisions: dict[str, bool | None],
     full: bool,
     family: str | None = None,
     seconds: float | int | None = None,
@@ -40,7 +40,7 @@ def advise(
     """Recommend a preset and overrides for the effects that a capture needs.
 
     Args:
-      wanted: Decision for each effect, None if undecided.
+      decisions: Decision for each effect, None if undecided.
       full: True for the sizes of the papers.
       family: A preset without "-small". One that is not advised is kept, unless it is
         static and motion is needed.
@@ -50,8 +50,8 @@ def advise(
       The recommendation.
     """
     overrides, notes = [], []
-    light_changes, has_transients = wanted.get(LIGHT), wanted.get(TRANSIENT)
-    moves = wanted.get(MOTION)
+    light_changes, has_transients = decisions.get(LIGHT), decisions.get(TRANSIENT)
+    moves = decisions.get(MOTION)
     grid = not full and (family is None or family.endswith("-grid"))
     static, dynamic = _best_grids(seconds) if grid else ADVISED
     preset = static if moves is False else dynamic
@@ -91,7 +91,11 @@ def advise(
         overrides += [f"transient.{n}={v}" for n, v in zip(names, size, strict=True)]
     if has_transients is False and spec.transient is not None:
         overrides.append("transient=none")
-    if is_dynamic and spec.background is not None and wanted.get(BACKGROUND) is False:
+    if (
+        is_dynamic
+        and spec.background is not None
+        and decisions.get(BACKGROUND) is False
+    ):
         overrides.append("background=none")
     return Choice(preset, tuple(overrides), tuple(notes))
 

@@ -49,7 +49,7 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
     tables = _tables(field)
     if not tables:
         return None
-    guided = spec.sampling.occupancy is not None
+    has_guide = spec.sampling.occupancy is not None
 
     def render_codes(field, params, camera, time, codes, step):
         return field.render(params, camera, time, codes, size, step)
@@ -59,7 +59,7 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
 
     def fit_codes(field, params, view, pixels, colors, step):
         # With the same samples as the rendered image.
-        guide = field.survey(params, step)[skipping.GUIDE] if guided else None
+        guide = field.survey(params, step)[skipping.GUIDE] if has_guide else None
         codes = field.codes_at(params, view)
 
         def loss(candidate):
@@ -85,8 +85,8 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer | None:
         params, step = state.params, state.step
 
         def fit_code(view: View, left: np.ndarray, valid: np.ndarray | None) -> Any:
-            observed = np.ones(left.shape[:2], bool) if valid is None else valid
-            place = np.argwhere(observed)
+            mask = np.ones(left.shape[:2], bool) if valid is None else valid
+            place = np.argwhere(mask)
             if not len(place):  # no valid pixels
                 return codes_of(params, view)
             # With replacement, so that shapes do not depend on the number of pixels.

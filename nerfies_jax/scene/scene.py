@@ -177,14 +177,14 @@ def drawing(
         view, frame_codes = observe(params, inputs)
         return radiance.render(params, view.camera, view.time, frame_codes, size, step)
 
-    def draw(params, occupied, inputs, size, step):
+    def draw(params, occupied_cells, inputs, size, step):
         view, frame_codes = observe(params, inputs)
         return radiance.render_occupied(
-            params, occupied, view.camera, view.time, frame_codes, size, step
+            params, occupied_cells, view.camera, view.time, frame_codes, size, step
         )
 
-    surveyed = None if radiance.survey is None else Surveyed(radiance.survey, draw)
-    return {"render": render, "surveyed": surveyed}
+    survey = None if radiance.survey is None else Surveyed(radiance.survey, draw)
+    return {"render": render, "surveyed": survey}
 
 
 def estimate_memory_bytes(spec: RadianceScene, capture: Capture) -> int:

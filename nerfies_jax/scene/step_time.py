@@ -58,11 +58,13 @@ def parts(
         "optimizer": part(descend, state, state.params),
     }
 
-    def with_rest(timed):
-        times = spec.micro_batches // model.devices
-        timed |= {name: times * timed[name] for name in ("rays", "forward", "both")}
-        timed["backward"] = max(timed.pop("both") - timed["forward"], 0.0)
+    def with_rest(part_ms):
+        micro_batches = spec.micro_batches // model.devices
+        part_ms |= {
+            name: micro_batches * part_ms[name] for name in ("rays", "forward", "both")
+        }
+        part_ms["backward"] = max(part_ms.pop("both") - part_ms["forward"], 0.0)
         whole = rate.step_ms(model, state, frames, spec.steps)
-        return timed | {"rest": max(whole - sum(timed.values()), 0.0)}
+        return part_ms | {"rest": max(whole - sum(part_ms.values()), 0.0)}
 
     return StepParts(programs, with_rest)

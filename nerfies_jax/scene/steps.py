@@ -65,14 +65,14 @@ def stepper(
 
     def step(state: TrainState, frames: Frames):
         if spec.micro_batches == 1:
-            (value, logged), grads = part(0, state, frames)
+            (value, term_values), grads = part(0, state, frames)
         else:
             each = data_parallel.on_devices(
                 part, spec.micro_batches, devices, state, frames
             )
-            (value, logged), grads = jax.tree.map(lambda leaf: leaf.mean(0), each)
+            (value, term_values), grads = jax.tree.map(lambda leaf: leaf.mean(0), each)
         params, moments = descend(spec, radiance.effects, state, grads)
-        metrics = {"loss": value, "mse": logged["fine"], **logged}
+        metrics = {"loss": value, "mse": term_values["fine"], **term_values}
         state = TrainState(params, moments, state.aux_state, state.step + 1, state.key)
         return state, metrics
 
@@ -326,22 +326,24 @@ def draw_batch(
     """
     row, line, column = random_pixels(frames, (count,), key, choice)
     if on_moving is not None:
-        more = random_pixels(
+        candidates = random_pixels(
             frames, (CANDIDATES, count), jax.random.fold_in(key, 0), choice
         )
-        moves = frames.moving[frames.image_row(more[0]), more[1], more[2]]
+        moves = frames.moving[
+            frames.image_row(candidates[0]), candidates[1], candidates[2]
+        ]
         place = jnp.argmax(moves, axis=0), jnp.arange(count)
-        replaced = on_moving & moves[place]
+        is_replaced = on_moving & moves[place]
         row, line, column = (
-            jnp.where(replaced, other[place], one)
-            for one, other in zip((row, line, column), more, strict=True)
+            jnp.where(is_replaced, other[place], one)
+            for one, other in zip((row, line, column), candidates, strict=True)
         )
     camera = jax.tree.map(lambda leaf: leaf[row], frames.cameras)
     pixel = jnp.stack([column, line], axis=1).astype(camera.position.dtype) + 0.5
     ray = jax.vmap(rays.pixel_ray)(camera, pixel)
-    color, observed = frames.colors(row, line, column)
+    color, is_observed = frames.colors(row, line, column)
     color = color.astype(pixel.dtype) / 255
-    valid = ray.valid if observed is None else ray.valid & observed
+    valid = ray.valid if is_observed is None else ray.valid & is_observed
     # Masked here for all losses, because unobserved pixels may be NaN, which a weight
     # of zero does not remove.
     color = jnp.where(valid[:, None], color, 0)

@@ -52,7 +52,7 @@ def without_effects(
     spec,
     metadata,
     without: tuple[str, ...],
-    blended: bool,
+    with_blending: bool,
 ) -> Model:
     """Return the model with some effects left out, or with blended appearances.
 
@@ -60,7 +60,7 @@ def without_effects(
       spec: The scene.
       metadata: Scene metadata.
       without: Names of the effects to leave out.
-      blended: True for a model that renders a `Between` in place of a view.
+      with_blending: True for a model that renders a `Between` in place of a view.
 
     Returns:
       The model.
@@ -71,7 +71,7 @@ def without_effects(
     """
     check_there(without, parts(spec, metadata).removable)
     field = scene.field(spec, metadata, without)
-    if blended and not _has_appearance(field):
+    if with_blending and not _has_appearance(field):
         raise ValueError(
             "this field has no appearance codes to blend; reconstruct with a preset "
             "that has them, such as nerf-w or nerfies"
@@ -89,7 +89,7 @@ def without_effects(
         return view, codes
 
     model = scene.build(spec, metadata)
-    return model._replace(**scene.drawing(field, blend if blended else plain))
+    return model._replace(**scene.drawing(field, blend if with_blending else plain))
 
 
 def appearance_id(capture: Capture, name: str) -> int:

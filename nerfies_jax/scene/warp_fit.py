@@ -140,9 +140,9 @@ def fit(
         jnp.asarray(_first_places(paths)),
     )
     solution = descended(loss, free, start.fit_rate, key, start.fit_steps)
-    separate, captured = programs.with_captured(mean_distance, free, key)
+    separate, constants = programs.with_captured(mean_distance, free, key)
     distance_of = jax.jit(separate)
-    first, last = (float(distance_of(captured, x, key)) for x in (free, solution))
+    first, last = (float(distance_of(constants, x, key)) for x in (free, solution))
     return WarpFit(params | solution[0], solution[1], first, last)
 
 
@@ -197,9 +197,9 @@ def fit_flow(
 
     medium = params[scene_flow.NAME]
     solution = descended(loss, medium, start.fit_rate, key, start.fit_steps)
-    separate, captured = programs.with_captured(mean_distance, medium)
+    separate, constants = programs.with_captured(mean_distance, medium)
     distance_of = jax.jit(separate)
-    first, last = (float(distance_of(captured, x)) for x in (medium, solution))
+    first, last = (float(distance_of(constants, x)) for x in (medium, solution))
     return FlowFit(params | {scene_flow.NAME: solution}, first, last)
 
 
@@ -247,33 +247,33 @@ def _distances(field, params, paths):
     position = jnp.asarray(np.moveaxis(paths.position, 1, 0))
     weight = jnp.asarray(paths.known.T, position.dtype)
     time, appearance = jnp.asarray(paths.time), jnp.asarray(paths.appearance)
-    trained = jnp.asarray(field.spec.steps)  # all bands of the warp are open
+    last_step = jnp.asarray(field.spec.steps)  # all bands of the warp are open
 
-    def distances(changed, canonical, frames, rows, static, key):
+    def distances(trainable, canonical, frames, rows, static, key):
         def frame_distances(frame, key):
             view = View(None, time[frame], appearance[frame])
-            codes = field.codes_at(params | changed, view)
-            condition = FrameCondition(view.time, codes, trained)
+            codes = field.codes_at(params | trainable, view)
+            condition = FrameCondition(view.time, codes, last_step)
 
-            def warped(point):
-                return point + field.displace(params | changed, point, condition)
+            def warp(point):
+                return point + field.displace(params | trainable, point, condition)
 
             def along(point, direction):
-                return jax.jvp(warped, (point,), (direction,))
+                return jax.jvp(warp, (point,), (direction,))
 
-            observed = position[frame][rows]
-            place, stretched = jax.vmap(along)(observed, _directions(key, observed))
+            points = position[frame][rows]
+            place, tangents = jax.vmap(along)(points, _directions(key, points))
             # Computed from the square, since a norm has no gradient at zero.
-            stretch = jnp.log(jnp.sum(stretched**2, axis=-1) + LEAST_STRETCH) / 2
-            gap, static_gap = place - canonical[rows], jax.vmap(warped)(static) - static
+            stretch = jnp.log(jnp.sum(tangents**2, axis=-1) + LEAST_STRETCH) / 2
+            gap, static_gap = place - canonical[rows], jax.vmap(warp)(static) - static
             return _length(gap), _length(static_gap), stretch**2
 
         moving, resting, stretch = jax.vmap(frame_distances)(
             frames, jax.random.split(key, len(frames))
         )
-        counted = weight[frames][:, rows]
-        moving, resting = _means(moving, resting, counted)
-        return moving, resting, STRETCH * _mean(stretch, counted)
+        sample_weight = weight[frames][:, rows]
+        moving, resting = _means(moving, resting, sample_weight)
+        return moving, resting, STRETCH * _mean(stretch, sample_weight)
 
     return distances
 
@@ -300,13 +300,13 @@ def _sample(paths, frames, key):
     return frame, rows, static
 
 
-def _means(moving, resting, counted):
+def _means(moving, resting, weight):
     """Compute the mean distances of known points and of static points."""
-    return _mean(moving, counted), jnp.sum(resting) / max(resting.size, 1)
+    return _mean(moving, weight), jnp.sum(resting) / max(resting.size, 1)
 
 
-def _mean(values, counted):
-    return jnp.sum(values * counted) / jnp.maximum(jnp.sum(counted), 1)
+def _mean(values, weight):
+    return jnp.sum(values * weight) / jnp.maximum(jnp.sum(weight), 1)
 
 
 def _first_places(paths):

@@ -23,7 +23,7 @@ def follow(
     metadata,
     state,
     capture: Capture,
-    known: GroundTruth,
+    truth: GroundTruth,
 ) -> PointTracks | None:
     """Track points from the start to all other times through the template of a field.
 
@@ -36,17 +36,17 @@ def follow(
       metadata: Scene metadata.
       state: Trained state, of `scene.build`.
       capture: The capture.
-      known: Ground truth, whose start points are tracked.
+      truth: Ground truth, whose start points are tracked.
 
     Returns:
       The tracks in scene units. None without such motion or without points.
     """
     field = scene.field(spec, metadata)
-    if not len(known.path):
+    if not len(truth.path):
         return None
     if all(effect.displace is None for effect in field.effects):
-        return _follow_flow(field, state, capture, known)
-    views = [evaluation.view_of(capture, int(row)) for row in known.track_rows]
+        return _follow_flow(field, state, capture, truth)
+    views = [evaluation.view_of(capture, int(row)) for row in truth.track_rows]
     views = jax.tree.map(lambda *leaves: np.stack(leaves), *views)
     center = np.asarray(metadata.center, np.float32)
 
@@ -61,7 +61,7 @@ def follow(
 
         conditions = jax.vmap(condition_of)(views)
         result = tracks.point_tracks(
-            field.displace, params, start, conditions, known.start
+            field.displace, params, start, conditions, truth.start
         )
         each = jax.vmap(field.displace, (None, 0, None))  # point
         shift = jax.vmap(each, (None, None, 0))(params, static, conditions)
@@ -75,13 +75,13 @@ def follow(
             state.params,
             state.step,
             views,
-            to_field(known.start_points),
-            to_field(known.path),
+            to_field(truth.start_points),
+            to_field(truth.path),
             to_field(static),
         )
     )
     path = result.points / np.float32(metadata.scale) + center
-    still_path = known.start_points[:, None]
+    still_path = truth.start_points[:, None]
     path = np.where(result.converged[..., None], path, still_path)
     stretch = np.linalg.svd(np.eye(3) + grads.astype(float), compute_uv=False)
     strain = np.log(np.maximum(stretch, LEAST_STRETCH))
@@ -125,9 +125,9 @@ def _follow_flow(field, state, capture, truth):
     apart = np.linalg.norm(
         static_path - static_path.mean(axis=1, keepdims=True), axis=-1
     )
-    lost = ~valid[:count, :, None]
+    is_lost = ~valid[:count, :, None]
     return PointTracks(
-        path=np.where(lost, truth.start_points[:, None], path[:count]).astype("f4"),
+        path=np.where(is_lost, truth.start_points[:, None], path[:count]).astype("f4"),
         converged=valid[:count],
         drift=float(apart.mean()) if apart.size else float("nan"),
         strain=float("nan"),
@@ -152,7 +152,7 @@ def _flow_mover(field) -> Move | None:
         flow = jax.vmap(lambda point: mean_flow(bound, point, condition))(points)
         return points + length * flow[:, side]
 
-    hopped = programs.Program(hop, field)
+    hop_program = programs.Program(hop, field)
 
     def move(state, points, source, target):
         begin, end = float(source.time), float(target.time)
@@ -162,10 +162,10 @@ def _flow_mover(field) -> Move | None:
         place = in_default_precision((points - center) * np.float32(metadata.scale))
         for time in np.linspace(begin, end, hops, endpoint=False):
             view = source._replace(time=jnp.asarray(time, source.time.dtype))
-            place = hopped(state.params, state.step, place, view, side, length)
-        reached = np.asarray(place) / np.float32(metadata.scale) + center
-        finite = np.isfinite(reached).all(axis=1)
-        return Moved(np.where(finite[:, None], reached, points), finite)
+            place = hop_program(state.params, state.step, place, view, side, length)
+        target_points = np.asarray(place) / np.float32(metadata.scale) + center
+        finite = np.isfinite(target_points).all(axis=1)
+        return Moved(np.where(finite[:, None], target_points, points), finite)
 
     return move
 
@@ -191,17 +191,17 @@ def mover(spec, metadata) -> Move | None:
 
         views = jax.tree.map(lambda *leaves: jnp.stack(leaves), source, target)
         conditions = jax.vmap(condition_of)(views)
-        tracked = tracks.point_tracks(field.displace, params, points, conditions, 0)
-        return tracked.points[:, 1], tracked.converged[:, 1]
+        paths = tracks.point_tracks(field.displace, params, points, conditions, 0)
+        return paths.points[:, 1], paths.converged[:, 1]
 
-    solved = programs.Program(solve, field)
+    solve_program = programs.Program(solve, field)
 
     def move(state, points, source, target):
         inside = in_default_precision((points - center) * np.float32(metadata.scale))
-        reached, finite = jax.device_get(
-            solved(state.params, state.step, inside, source, target)
+        target_place, finite = jax.device_get(
+            solve_program(state.params, state.step, inside, source, target)
         )
-        position = reached / np.float32(metadata.scale) + center
+        position = target_place / np.float32(metadata.scale) + center
         return Moved(np.where(finite[:, None], position, points), finite)
 
     return move

@@ -49,7 +49,7 @@ class History(NamedTuple):
 
 def color_depth(
     depth: np.ndarray,
-    known: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Colored:
     """Map depth to viridis: near is bright, far is dark, unknown is gray.
@@ -58,7 +58,7 @@ def color_depth(
 
     Args:
       depth: Depths, [..., height, width].
-      known: True for known depths, of the same shape. None for all. Depths that are not
+      valid: True for known depths, of the same shape. None for all. Depths that are not
         finite and positive are always unknown.
       limits: Lowest and highest value. None for the 1st and 99th percentile of known
         depths.
@@ -68,12 +68,12 @@ def color_depth(
     """
     depth = np.asarray(depth, np.float32)
     positive = np.isfinite(depth) & (depth > 0)
-    known = positive if known is None else positive & known
+    valid = positive if valid is None else positive & valid
     if limits is None:
-        limits = _limits(depth[known])
+        limits = _limits(depth[valid])
     low, high = limits
-    nearness = 1 - np.where(known, depth - low, 0) / _span(low, high)
-    return Colored(_apply_map(nearness, known, DEPTH_MAP), low, high)
+    nearness = 1 - np.where(valid, depth - low, 0) / _span(low, high)
+    return Colored(_apply_map(nearness, valid, DEPTH_MAP), low, high)
 
 
 def color_error(image: np.ndarray, truth: np.ndarray, largest: float | int) -> Colored:
@@ -218,10 +218,10 @@ def contact_sheet(
             f"a contact sheet needs a caption for each image, got {len(cells)} "
             f"images and {len(captions)} captions"
         )
-    enlarged = _enlarge(np.stack([as_bytes(cell) for cell in cells]))
+    image_stack = _enlarge(np.stack([as_bytes(cell) for cell in cells]))
     tiles = [
         _join_vertically([image, _text(caption, image.shape[1], color=CAPTION)])
-        for image, caption in zip(enlarged, captions, strict=True)
+        for image, caption in zip(image_stack, captions, strict=True)
     ]
     columns = min(columns, len(tiles))
     tiles += [_blank(*tiles[0].shape[:2])] * (-len(tiles) % columns)
@@ -395,8 +395,8 @@ def _blank(height, width):
 
 def _join_horizontally(panels):
     gap = _blank(panels[0].shape[0], GAP)
-    spaced = [part for panel in panels for part in (panel, gap)][:-1]
-    return np.concatenate(spaced, axis=1)
+    parts = [part for panel in panels for part in (panel, gap)][:-1]
+    return np.concatenate(parts, axis=1)
 
 
 def _join_vertically(rows):
