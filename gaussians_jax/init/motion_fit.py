@@ -21,7 +21,7 @@ from gaussians_jax.core.splats import Params, Splats
 from nerfies_jax.preprocessing import rigid_groups
 from nerfies_jax.training import programs
 from nerfies_jax.training.effects import FrameCondition
-from nerfies_jax.training.updates import descended
+from nerfies_jax.training.updates import minimize
 
 PyTree = Any
 # Number of frames in each step. Built-in scene, seconds on one busy core and the final
@@ -405,7 +405,7 @@ def fit(
     all_frames = np.arange(len(times))
     separate, arrays = programs.with_captured(lambda p: distance(p, all_frames), start)
     mean_distance = jax.jit(separate)
-    solution = descended(loss, start, rates, key, steps)
+    solution = minimize(loss, start, rates, key, steps)
     first, last = (float(mean_distance(arrays, p)) for p in (start, solution))
     return PathFit(_take(solution, slice(size)), first, last)
 

@@ -339,5 +339,5 @@ def with_steps(spec: SplatScene, steps: int) -> SplatScene:
     """
     if steps < 1:
         raise ValueError(f"steps={steps} must be at least 1")
-    in_proportion = step_counts.stretched(spec, steps / spec.steps)
+    in_proportion = step_counts.scale_steps(spec, steps / spec.steps)
     return dataclasses.replace(in_proportion, steps=steps)

@@ -34,7 +34,7 @@ from nerfies_jax.training.effects import (
     FrameCondition,
     Observation,
     PenaltyContext,
-    joined,
+    join,
     penalty_terms,
     values,
     weighted_sum,
@@ -99,7 +99,7 @@ def all_effects(
         or more than one component has child Gaussians or changes colors.
     """
     built_in = effects_of(spec, metadata)
-    effects = joined(built_in, more, reserved=("splats",))
+    effects = join(built_in, more, reserved_names=("splats",))
     for effect in effects:
         if effect.init and not effect.learning_rate:
             raise ValueError(

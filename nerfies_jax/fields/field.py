@@ -24,7 +24,7 @@ from nerfies_jax.training.effects import (
     TIMESTAMP,
     FrameCondition,
     Table,
-    joined,
+    join,
     stream,
 )
 from nerfies_jax.training.model import Rendering, View
@@ -88,7 +88,7 @@ def field(
       The field.
     """
     built_in = specs.effects_of(spec, metadata)
-    all_effects = joined(built_in, effects, reserved=("template", "codes"))
+    all_effects = join(built_in, effects, reserved_names=("template", "codes"))
     tables = specs.tables_of(all_effects)
     active = _active(all_effects, without)
     bind = functools.partial(Bound, spec, metadata, active)

@@ -459,5 +459,5 @@ def with_steps(spec: RadianceScene, steps: int) -> RadianceScene:
     """
     if steps < 1:
         raise ValueError(f"steps={steps}: train for at least one step")
-    in_proportion = step_counts.stretched(spec, steps / spec.steps)
+    in_proportion = step_counts.scale_steps(spec, steps / spec.steps)
     return dataclasses.replace(in_proportion, steps=steps)

@@ -23,7 +23,7 @@ from nerfies_jax.training import programs
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import TrackStartSpec
-from nerfies_jax.training.updates import descended
+from nerfies_jax.training.updates import minimize
 
 PyTree = Any
 FRAMES_AT_ONCE, POINTS_AT_ONCE, STILL_AT_ONCE = 12, 256, 128  # per step
@@ -139,7 +139,7 @@ def fit(
         {name: params[name] for name in (*sorted(names), "codes")},
         jnp.asarray(_first_places(paths)),
     )
-    solution = descended(loss, free, start.fit_rate, key, start.fit_steps)
+    solution = minimize(loss, free, start.fit_rate, key, start.fit_steps)
     separate, constants = programs.with_captured(mean_distance, free, key)
     distance_of = jax.jit(separate)
     first, last = (float(distance_of(constants, x, key)) for x in (free, solution))
@@ -196,7 +196,7 @@ def fit_flow(
         return errors(medium, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
 
     medium = params[scene_flow.NAME]
-    solution = descended(loss, medium, start.fit_rate, key, start.fit_steps)
+    solution = minimize(loss, medium, start.fit_rate, key, start.fit_steps)
     separate, constants = programs.with_captured(mean_distance, medium)
     distance_of = jax.jit(separate)
     first, last = (float(distance_of(constants, x)) for x in (medium, solution))

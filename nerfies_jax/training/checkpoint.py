@@ -174,11 +174,11 @@ class Checkpoints:
             raise FileNotFoundError(f"{self._beside} no longer exists")
         with tempfile.TemporaryFile(dir=self.folder):
             pass
-        needed = sum(array.nbytes for array in leaves.values()) + SPARE_BYTES
+        required_bytes = sum(array.nbytes for array in leaves.values()) + SPARE_BYTES
         free = shutil.disk_usage(self.folder).free
-        if free < needed:
+        if free < required_bytes:
             raise OSError(
-                f"no space: up to {needed / 1e6:.1f} MB are needed and "
+                f"no space: up to {required_bytes / 1e6:.1f} MB are needed and "
                 f"{free / 1e6:.1f} MB are free"
             )
 
@@ -214,9 +214,9 @@ def _write_arrays(folder, leaves):
         handler.finalize(folder)
 
 
-def _read_arrays(folder, expected):
+def _read_arrays(folder, templates):
     with contextlib.closing(_array_handler()) as handler:
-        args = ocp.args.StandardRestore(expected)
+        args = ocp.args.StandardRestore(templates)
         return handler.restore(folder, args=args)
 
 
@@ -312,11 +312,11 @@ def restore(folder, example: PyTree, spec, *, step: int | None = None) -> Restor
                 raise ValueError(f"{message}; there is no older one") from error
             warnings.warn(f"{message}; trying an older one", RuntimeWarning, 2)
             continue
-        changed = differences(about["spec"], as_json(spec))
-        if changed:
+        changes = differences(about["spec"], as_json(spec))
+        if changes:
             raise ValueError(
                 f"checkpoint {folder / str(candidate)} was made with other settings: "
-                + "; ".join(changed)
+                + "; ".join(changes)
             )
         state = _decode(leaves, about["leaves"], example, folder / str(candidate))
         return Restored(state, about["step"], about["record"], about)
@@ -373,12 +373,12 @@ def _read(folder):
     try:
         about = _read_about(folder)
         notes = about["leaves"]
-        expected = {
+        templates = {
             name: np.empty(note["shape"], note["dtype"])
             for name, note in notes.items()
             if 0 not in note["shape"]
         }
-        leaves = _read_arrays(folder / _STATE, expected)
+        leaves = _read_arrays(folder / _STATE, templates)
     except (_Damaged, _NewerFormat):
         raise
     except Exception as error:  # orbax and tensorstore raise many types
@@ -398,24 +398,24 @@ def _read(folder):
 def _decode(leaves, notes, example, source):
     """Arrange the leaves in the structure of `example`, on the device."""
     paths, structure = jax.tree_util.tree_flatten_with_path(example)
-    expected = {
+    templates = {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
         for path, leaf in paths
     }
-    if expected.keys() != notes.keys():
+    if templates.keys() != notes.keys():
         missing, unknown = (
-            expected.keys() - notes.keys(),
-            notes.keys() - expected.keys(),
+            templates.keys() - notes.keys(),
+            notes.keys() - templates.keys(),
         )
         raise ValueError(
             f"checkpoint {source} was saved by another version: it lacks "
             f"{sorted(missing)} and has the unknown {sorted(unknown)}"
         )
-    decoded = []
-    for name, template in expected.items():
+    arrays = []
+    for name, template in templates.items():
         array = leaves[name]
         if "key" in notes[name]:
-            decoded.append(jax.random.wrap_key_data(array, impl=notes[name]["key"]))
+            arrays.append(jax.random.wrap_key_data(array, impl=notes[name]["key"]))
             continue
         same = array.dtype == template.dtype and array.ndim == template.ndim
         if not same or array.shape[1:] != template.shape[1:]:
@@ -425,8 +425,8 @@ def _decode(leaves, notes, example, source):
                 f"{template.dtype}{list(template.shape)}; only the first axis may "
                 "differ; for another precision set jax_enable_x64 as in the saved run"
             )
-        decoded.append(jnp.array(array))
-    return jax.tree_util.tree_unflatten(structure, decoded)
+        arrays.append(jnp.array(array))
+    return jax.tree_util.tree_unflatten(structure, arrays)
 
 
 def _check_writable(folder):

@@ -86,10 +86,10 @@ def _run_scan(step, length, state, frames, numbers):
         jnp.ones(length, bool),
     )
     all_finite = jnp.all(finite)
-    done = jnp.where(all_finite, length, 1 + jnp.argmin(finite))
+    steps = jnp.where(all_finite, length, 1 + jnp.argmin(finite))
     # Divided before summing, so that the sum does not overflow.
     mean = {name: jnp.sum(x / length) for name, x in metrics.items()}
-    return state, Outcome(done, mean, all_finite & _all_finite(state), state.step)
+    return state, Outcome(steps, mean, all_finite & _all_finite(state), state.step)
 
 
 def _all_finite(tree):
@@ -220,14 +220,14 @@ class Program:
         if self._spans:
             hosts.meet()
         total: dict[str, float] = {}
-        done, outcome = 0, None
+        steps, outcome = 0, None
         for length in self._lengths(count):
             # The window has no other name here, so that it is freed after its steps.
             state, outcome = self._programs[length](
-                state, _window(frames, state, length, count - done), self._numbers
+                state, _window(frames, state, length, count - steps), self._numbers
             )
             outcome = jax.device_get(outcome)
-            done += int(outcome.done)
+            steps += int(outcome.done)
             for name, mean in outcome.metrics.items():
                 total[name] = total.get(name, 0.0) + mean * (length / count)
             if not outcome.finite:
@@ -236,7 +236,7 @@ class Program:
         state = data_parallel.first_copy(state, self._devices)
         if self._spans:
             hosts.remember(state)
-        return state, outcome._replace(done=done, metrics=total)
+        return state, outcome._replace(done=steps, metrics=total)
 
 
 def _step(model, state, frames, numbers):
@@ -281,10 +281,10 @@ def program(
     return programs[key], time.perf_counter() - began
 
 
-def compiled(
+def compile_program(
     model: Model, state: TrainState, frames: TrainingFrames, steps: int
 ) -> tuple[Program, TrainingFrames, float]:
-    """Return the program of a run with its scan compiled.
+    """Compile the scan of a run and return its program.
 
     Args:
       model: The model.
@@ -295,8 +295,8 @@ def compiled(
     Returns:
       The program, the frames on its devices, and the seconds of tracing and compiling.
     """
-    lowered, frames, seconds = _lower_program(model, state, frames, steps)
-    return lowered, frames, seconds + lowered.prepare(lowered.length)
+    scan_program, frames, seconds = _lower_program(model, state, frames, steps)
+    return scan_program, frames, seconds + scan_program.prepare(scan_program.length)
 
 
 def compiling(
@@ -313,14 +313,14 @@ def compiling(
     Returns:
       A future of the seconds of tracing and compiling.
     """
-    lowered, _, seconds = _lower_program(model, state, frames, steps)
-    return compiler.begun(lambda: seconds + lowered.prepare(lowered.length))
+    scan_program, _, seconds = _lower_program(model, state, frames, steps)
+    return compiler.begun(lambda: seconds + scan_program.prepare(scan_program.length))
 
 
 def _lower_program(model, state, frames, steps):
     _, frames = frame_stream.replicate(frames, model.devices)
-    lowered, seconds = program(model, state, frames, steps)
-    return lowered, frames, seconds
+    scan_program, seconds = program(model, state, frames, steps)
+    return scan_program, frames, seconds
 
 
 # Bounded, because the programs of a model hold 4,000 or more memory mappings, and Linux

@@ -170,15 +170,15 @@ def stream(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
-def joined(
-    own: tuple[R, ...], more: tuple[R, ...], reserved: tuple[str, ...]
+def join(
+    own: tuple[R, ...], more: tuple[R, ...], reserved_names: tuple[str, ...]
 ) -> tuple[R, ...]:
     """Concatenate the records of a spec and further ones, checking their names.
 
     Args:
       own: Records of the components of a spec.
       more: Further records.
-      reserved: Names that the parameters of the scene already use.
+      reserved_names: Names that the parameters of the scene already use.
 
     Returns:
       All records.
@@ -186,7 +186,7 @@ def joined(
     Raises:
       ValueError: If two components have the same name.
     """
-    names = list(reserved)
+    names = list(reserved_names)
     for part in (*own, *more):
         if part.name in names:
             raise ValueError(
@@ -265,8 +265,8 @@ def weighted_sum(terms: Mapping[str, Term], first: Scalar | None = None) -> Scal
     Returns:
       The sum, in the order of the terms.
     """
-    weighted = [t.weight * t.value for t in terms.values() if t.weight is not None]
-    return total(weighted if first is None else [first, *weighted])
+    summands = [t.weight * t.value for t in terms.values() if t.weight is not None]
+    return total(summands if first is None else [first, *summands])
 
 
 def total(values: Iterable[Scalar]) -> Scalar:

@@ -105,11 +105,11 @@ def _import(name):
         ) from error
 
 
-def names_in(stored: Any, key: str) -> tuple[str, ...]:
+def names_in(document: Any, key: str) -> tuple[str, ...]:
     """Return the names of classes from other packages in JSON values.
 
     Args:
-      stored: JSON values of settings.
+      document: JSON values of settings.
       key: Key of the class name in a JSON object.
 
     Returns:
@@ -128,7 +128,7 @@ def names_in(stored: Any, key: str) -> tuple[str, ...]:
             for item in value.values():
                 visit(item)
 
-    visit(stored)
+    visit(document)
     return tuple(names)
 
 

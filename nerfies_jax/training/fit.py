@@ -45,7 +45,7 @@ def check_positive(**values):
             raise ValueError(f"{name}={value} must be positive and finite")
 
 
-def counted(steps) -> Int[Array, "*batch"]:
+def as_int32(steps) -> Int[Array, "*batch"]:
     """Convert step counts to int32. Solvers count in the default integer type.
 
     Args:
@@ -110,8 +110,8 @@ def fit_code(
     code = jnp.where(better, minimum, flat)
     value, grad = jax.value_and_grad(flat_loss)(code)
     residual = _length(grad)
-    converged = jnp.isfinite(value) & (residual <= tolerance)
-    return Fit(rebuild(code), converged, counted(steps), residual)
+    is_converged = jnp.isfinite(value) & (residual <= tolerance)
+    return Fit(rebuild(code), is_converged, as_int32(steps), residual)
 
 
 # (loss of a flat code, start, max_steps, tolerance) -> code, steps
@@ -165,7 +165,7 @@ def _optax_solver(transformation):
     def solve(loss, start, max_steps, tolerance):
         rule = optax.with_extra_args_support(transformation(max_steps))
 
-        def unfinished(state):
+        def has_more(state):
             _, _, _, grad, _, step = state
             return (step < max_steps) & (_length(grad) > tolerance)
 
@@ -186,7 +186,7 @@ def _optax_solver(transformation):
 
         value, grad = jax.value_and_grad(loss)(start)
         state = start, rule.init(start), value, grad, (start, value), jnp.int32(0)
-        *_, best, steps = lax.while_loop(unfinished, descend, state)
+        *_, best, steps = lax.while_loop(has_more, descend, state)
         return best[0], steps
 
     return solve

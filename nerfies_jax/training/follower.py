@@ -36,12 +36,12 @@ def follow(
             hosts.check_frames(message, frame_stream.layout_of(frames))
             compiles = message["kind"] == hosts.COMPILE
             if compiles or message["arrays"]:
-                received = hosts.received_state(message, example)
+                input_state = hosts.received_state(message, example)
             else:
-                received = state
-            program, _ = chunk.program(model, received, frames, message["steps"])
+                input_state = state
+            program, _ = chunk.program(model, input_state, frames, message["steps"])
             if compiles:
                 program.prepare(message["count"])
                 hosts.meet()
             else:
-                state, _ = program(received, frames, message["count"])
+                state, _ = program(input_state, frames, message["count"])

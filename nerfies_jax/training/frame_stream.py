@@ -168,10 +168,10 @@ def check_memory(
         images = reads[0].size / (height * width)
     window = images * sum(array.nbytes // len(array) for array in pixels.values())
     always = sum(leaf.nbytes for leaf in jax.tree.leaves(frames))
-    needed = always + WINDOWS * window
-    if needed > limit:
+    total = always + WINDOWS * window
+    if total > limit:
         raise ValueError(
-            f"frame_memory={limit / 2**30:.3g}: {needed / 2**30:.3g} GiB of device "
+            f"frame_memory={limit / 2**30:.3g}: {total / 2**30:.3g} GiB of device "
             f"memory are needed for the frames of {WINDOWS * STEPS} steps, and for "
             "flow and points; increase it, read smaller images with max_side=..., or "
             "use fewer views per step"

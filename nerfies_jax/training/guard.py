@@ -36,7 +36,7 @@ class Snapshot:
             self._structure, [_to_device(*leaf) for leaf in self._leaves]
         )
 
-    def renewed(self, step: int, state: TrainState, after_event: bool) -> "Snapshot":
+    def renew(self, step: int, state: TrainState, after_event: bool) -> "Snapshot":
         """Return a newer snapshot if its cost is acceptable, and always after an event.
 
         A replay from a snapshot runs steps only, so it must not cross an event.
@@ -121,7 +121,7 @@ def last_good(
             bad = middle
     state, _, metrics = replay(bad)
     names = [f"metric {name}" for name, x in metrics.items() if not np.isfinite(x)]
-    detail = f"step {bad:,} is not finite: {listed(names + bad_arrays(state))}"
+    detail = f"step {bad:,} is not finite: {join_names(names + bad_arrays(state))}"
     return replay(good)[0], good, detail
 
 
@@ -129,7 +129,7 @@ def _contents(snapshot):
     return snapshot.state(), snapshot.step
 
 
-def listed(names):
+def join_names(names):
     """Join the first few of several names.
 
     Args:

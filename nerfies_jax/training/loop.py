@@ -16,7 +16,7 @@ from nerfies_jax.runtime.progress import duration
 from nerfies_jax.runtime.stopping import StopRequests
 from nerfies_jax.training import best, chunk, frame_stream
 from nerfies_jax.training.checkpoint import Checkpoints
-from nerfies_jax.training.guard import Snapshot, bad_arrays, last_good, listed
+from nerfies_jax.training.guard import Snapshot, bad_arrays, join_names, last_good
 from nerfies_jax.training.model import Event, Model, TrainState
 
 CHUNK_STEPS = 100  # longer chunks are not faster
@@ -179,7 +179,8 @@ class _Run:
         bad = bad_arrays(state)
         if bad:
             raise ValueError(
-                f"the initial state is not finite: {listed(bad)}; start from another"
+                f"the initial state is not finite: {join_names(bad)}; "
+                "start from another"
             )
         # A copy, because the first chunk overwrites its input, which is the caller's.
         self.snapshot = Snapshot(self.step, state)
@@ -208,29 +209,29 @@ class _Run:
         """Run one chunk and the events after it. Return False if not all is finite."""
         began, cpu_began = time.perf_counter(), time.process_time()
         self.state, outcome = program(self.state, self.device_frames, count)
-        done = outcome.done
+        steps = outcome.done
         if not outcome.finite:
             self.state, self.step, self.failure_detail = last_good(
-                program, self.snapshot, self.device_frames, self.step, self.step + done
+                program, self.snapshot, self.device_frames, self.step, self.step + steps
             )
             return False
-        if int(outcome.step) != self.step + done:
+        if int(outcome.step) != self.step + steps:
             raise ValueError(
                 f"Model.step returned state.step={int(outcome.step)} after step "
-                f"{self.step + done}; each step must increase it by one"
+                f"{self.step + steps}; each step must increase it by one"
             )
-        elapsed = time.perf_counter() - began
-        due_events = self.events.get(self.step + done, ())
-        if not self._apply_events(due_events, self.step + done):
+        seconds = time.perf_counter() - began
+        due_events = self.events.get(self.step + steps, ())
+        if not self._apply_events(due_events, self.step + steps):
             # Go back to before that step, so that a resumed run applies the event.
-            count = self.step + done - 1 - self.snapshot.step
-            self.state, self.step = self.snapshot.state(), self.step + done - 1
+            count = self.step + steps - 1 - self.snapshot.step
+            self.state, self.step = self.snapshot.state(), self.step + steps - 1
             if count:
                 self.state, _ = program(self.state, self.device_frames, count)
             return False
-        self.step += done
+        self.step += steps
         self.stage.done = self.step
-        self.step_seconds = elapsed / done
+        self.step_seconds = seconds / steps
         self._add_time(
             seconds=time.perf_counter() - began,
             cpu_seconds=time.process_time() - cpu_began,
@@ -238,7 +239,7 @@ class _Run:
         metrics = {name: float(x) for name, x in outcome.metrics.items()}
         row = {**self._position(), **metrics}
         self.history = self.history._replace(rows=(*self.history.rows, row))
-        self.snapshot = self.snapshot.renewed(self.step, self.state, bool(due_events))
+        self.snapshot = self.snapshot.renew(self.step, self.state, bool(due_events))
         return True
 
     def _apply_events(self, due_events, step) -> bool:
@@ -251,7 +252,7 @@ class _Run:
             if bad:
                 self.failure_detail = (
                     f"event {event.name!r} after step {step:,} is not finite: "
-                    f"{listed(bad)}"
+                    f"{join_names(bad)}"
                 )
                 return False
         return True
@@ -335,8 +336,8 @@ class _Run:
             return self.step != last_step
         if hook.every_seconds is None:
             return False
-        elapsed = self.history.seconds - (last_seconds or 0.0)
-        return last_seconds is None or elapsed >= hook.every_seconds
+        interval = self.history.seconds - (last_seconds or 0.0)
+        return last_seconds is None or interval >= hook.every_seconds
 
     def _call_hook(self, hook: Hook) -> None:
         numbers = hook.call(self.state, self.step, self._metrics())
@@ -413,8 +414,8 @@ class _Run:
                 if reason not in ("steps", "non-finite"):
                     message += ", from where it can be resumed"
         event_stream.message(message)
-        unsaved = "" if failure is None else f"the last state is not saved: {failure}"
-        return FitResult(self.state, self.history, self.step, reason, message, unsaved)
+        error = "" if failure is None else f"the last state is not saved: {failure}"
+        return FitResult(self.state, self.history, self.step, reason, message, error)
 
 
 def _distinct(state: TrainState) -> TrainState:

@@ -447,11 +447,11 @@ def _blur(
 def _window_sum(values, padding, axis, stride):
     pad = [(0, 0), (0, 0)]
     pad[axis] = (RADIUS * stride, RADIUS * stride)
-    padded = jnp.pad(values, pad, constant_values=padding)
+    padded_values = jnp.pad(values, pad, constant_values=padding)
     # Without the barrier XLA fuses the padding into each of the eleven reads, which
     # takes twice the time.
-    padded = lax.optimization_barrier(padded)
-    take = functools.partial(lax.slice_in_dim, padded, axis=axis)
+    padded_values = lax.optimization_barrier(padded_values)
+    take = functools.partial(lax.slice_in_dim, padded_values, axis=axis)
     length = values.shape[axis]
     return sum(
         weight * take(tap * stride, tap * stride + length)

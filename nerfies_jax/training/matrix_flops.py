@@ -66,10 +66,10 @@ def _variables(operands):
 
 
 def _product(equation):
-    (contracted, _), _ = equation.params["dimension_numbers"]
+    (axes, _), _ = equation.params["dimension_numbers"]
     left = equation.invars[0].aval.shape
-    shared = math.prod(left[axis] for axis in contracted)
-    return 2.0 * shared * math.prod(equation.outvars[0].aval.shape)
+    inner_size = math.prod(left[axis] for axis in axes)
+    return 2.0 * inner_size * math.prod(equation.outvars[0].aval.shape)
 
 
 def _dense(equation):

@@ -42,18 +42,20 @@ def taking(owner: Owner, numbers: PyTree, build: Callable[[PyTree], Owner]) -> O
     """
     original = _fields(owner)
 
-    def renewed(current, numbers):
+    def replace_numbers(current, numbers):
         try:
-            rebuilt = _fields(build(numbers))
+            new_fields = _fields(build(numbers))
         except _CONCRETE_NUMBERS_NEEDED:
             return current
         fields = _fields(current)
         same = {
-            name: rebuilt[name] for name in fields if fields[name] is original[name]
+            name: new_fields[name] for name in fields if fields[name] is original[name]
         }
         return type(owner)(**fields | same)
 
-    return type(owner)(**original | {"numbers": numbers, "with_numbers": renewed})
+    return type(owner)(
+        **original | {"numbers": numbers, "with_numbers": replace_numbers}
+    )
 
 
 def _fields(owner):
@@ -125,15 +127,17 @@ def with_captured(
       A function of the list of captured arrays and of arguments like `args`, and that
       list.
     """
-    closed, result = jax.make_jaxpr(function, return_shape=True)(*args)
+    closed_jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*args)
     structure = jax.tree.structure(result)
 
-    def separate(captured, *args):
-        program = core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, captured))
+    def separate(constants, *args):
+        program = core.jaxpr_as_fun(core.ClosedJaxpr(closed_jaxpr.jaxpr, constants))
         return jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
 
-    captured = [x if isinstance(x, jax.Array) else np.asarray(x) for x in closed.consts]
-    return separate, captured
+    constants = [
+        x if isinstance(x, jax.Array) else np.asarray(x) for x in closed_jaxpr.consts
+    ]
+    return separate, constants
 
 
 def deformer(model: Model) -> Callable[[PyTree], Callable[[Any], PyTree]]:
@@ -148,8 +152,8 @@ def deformer(model: Model) -> Callable[[PyTree], Callable[[Any], PyTree]]:
     prepared_of, deformed_of = Program(prepare, model), Program(deform, model)
 
     def deformer_of(params):
-        prepared = prepared_of(params)
-        return lambda time: deformed_of(params, prepared, time)
+        preparation = prepared_of(params)
+        return lambda time: deformed_of(params, preparation, time)
 
     return deformer_of
 
@@ -168,17 +172,17 @@ def prepare(model: Model, params: PyTree) -> PyTree:
     return model.stages.prepare(params)
 
 
-def deform(model: Model, params: PyTree, prepared: PyTree, time: Any) -> PyTree:
+def deform(model: Model, params: PyTree, preparation: PyTree, time: Any) -> PyTree:
     """Call the second stage of rendering.
 
     Args:
       model: A model with stages.
       params: Its parameters.
-      prepared: Result of `prepare`.
+      preparation: Result of `prepare`.
       time: Time in [0, 1] over the capture.
 
     Returns:
       The scene at this time.
     """
     assert model.stages is not None
-    return model.stages.deform(params, prepared, time)
+    return model.stages.deform(params, preparation, time)

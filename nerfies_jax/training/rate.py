@@ -43,25 +43,27 @@ def step_time(
     Returns:
       Seconds per step and seconds of compilation.
     """
-    program, frames, compile_seconds = chunk.compiled(model, state, frames, steps)
+    program, frames, compile_seconds = chunk.compile_program(
+        model, state, frames, steps
+    )
     length = program.length
 
-    def timed(start, count):
+    def time_steps(start, count):
         began = time.perf_counter()
         end, outcome = program(start, frames, count)
-        done = max(outcome.done, 1)  # less than `count` if a step is not finite
-        return end, (time.perf_counter() - began) / done
+        done_steps = max(outcome.done, 1)  # less than `count` if a step is not finite
+        return end, (time.perf_counter() - began) / done_steps
 
     seconds = []
     for fraction in PHASES:
         # A copy, because the program overwrites its input.
         start = jax.tree.map(jnp.copy, state)
         start = start._replace(step=jnp.full_like(state.step, int(fraction * steps)))
-        start, _ = timed(start, length)
-        start, estimate = timed(start, length)
+        start, _ = time_steps(start, length)
+        start, estimate = time_steps(start, length)
         scans = round(PHASE_SECONDS / (length * estimate))
         count = length * min(max(scans, 1), MOST_STEPS // length)
-        seconds.append(timed(start, count)[1])
+        seconds.append(time_steps(start, count)[1])
     return StepTime(float(np.mean(seconds)), compile_seconds)
 
 
@@ -82,7 +84,7 @@ def step_ms(
     Returns:
       Milliseconds per step.
     """
-    program, frames, _ = chunk.compiled(model, state, frames, steps)
+    program, frames, _ = chunk.compile_program(model, state, frames, steps)
     current = jax.tree.map(jnp.copy, state)
     seconds: list[float] = []
     while len(seconds) < REPEATS and sum(seconds) < REPEAT_SECONDS:

@@ -191,10 +191,10 @@ def time_noise(frames: int, steps: int = 20_000, scale: float = 0.1) -> Schedule
 def _share(step, steps, after=0):
     """Compute the fraction of the interval that has passed, from 0 to 1."""
     # Subtracted as integers, because float32 cannot count beyond 16.7 million steps.
-    elapsed = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
-    share = elapsed.astype(jnp.result_type(float)) / steps
+    progress = jnp.clip(jnp.asarray(step, jnp.int32) - after, 0, steps)
+    share = progress.astype(jnp.result_type(float)) / steps
     # XLA multiplies by the rounded 1 / steps, so the last value may differ from one.
-    return jnp.where(elapsed == steps, 1.0, share)
+    return jnp.where(progress == steps, 1.0, share)
 
 
 def _with_ends(share, between, start, end):

@@ -79,11 +79,11 @@ def _items(content, path):
     return {key: _plain(item, f"{path}.{key}") for key, item in content.items()}
 
 
-def from_json(stored: Any, *kinds: type) -> Any:
+def from_json(document: Any, *kinds: type) -> Any:
     """Read the value that `as_json` wrote.
 
     Args:
-      stored: JSON values.
+      document: JSON values.
       *kinds: Outermost types that are allowed. The types of their annotated fields are
         allowed too, and no others.
 
@@ -94,7 +94,7 @@ def from_json(stored: Any, *kinds: type) -> Any:
       ValueError: If a type is not allowed, or a field is unknown, missing or out of
         range. Nothing is imported to check this.
     """
-    return _revive(stored, allowed_names(*kinds))
+    return _revive(document, allowed_names(*kinds))
 
 
 def allowed_names(*kinds: type) -> dict[str, type]:
@@ -109,23 +109,23 @@ def allowed_names(*kinds: type) -> dict[str, type]:
     return {type_name(kind): kind for kind in _collect_records(kinds)}
 
 
-def _revive(stored, allowed):
-    if isinstance(stored, list):
-        return tuple(_revive(item, allowed) for item in stored)
-    if not isinstance(stored, dict):
-        return stored
-    if stored.keys() == {NUMBER}:
-        return float(stored[NUMBER])
-    fields = {key: _revive(item, allowed) for key, item in stored.items()}
-    if TYPE not in stored:
+def _revive(node, kinds):
+    if isinstance(node, list):
+        return tuple(_revive(item, kinds) for item in node)
+    if not isinstance(node, dict):
+        return node
+    if node.keys() == {NUMBER}:
+        return float(node[NUMBER])
+    fields = {key: _revive(item, kinds) for key, item in node.items()}
+    if TYPE not in node:
         return fields
     name = fields.pop(TYPE)
-    if not isinstance(name, str) or name not in allowed:
+    if not isinstance(name, str) or name not in kinds:
         raise ValueError(
             f"it names {name!r}, which is no record or setting of this version that "
             "may be here"
         )
-    return build_record(allowed[name], fields)
+    return build_record(kinds[name], fields)
 
 
 def _collect_records(kinds):
@@ -161,13 +161,13 @@ def build_record(kind: type[Any], fields: dict[str, Any]) -> Any:
       ValueError: If the fields are not those of this version.
     """
     if dataclasses.is_dataclass(kind):
-        expected = {field.name for field in dataclasses.fields(kind)}
+        names = {field.name for field in dataclasses.fields(kind)}
     else:
-        expected = {*kind._fields}
-    if fields.keys() != expected:
+        names = {*kind._fields}
+    if fields.keys() != names:
         raise ValueError(
             f"a stored {kind.__name__} with {', '.join(sorted(fields))} is none of "
-            f"this version, which has {', '.join(sorted(expected))}; open it with the "
+            f"this version, which has {', '.join(sorted(names))}; open it with the "
             "version that made it"
         )
     return kind(**fields)
@@ -221,20 +221,20 @@ def record_named(name: Any) -> type:
 # Comparing --------------------------------------------------------------------------
 
 
-def differences(saved: Any, current: Any) -> list[str]:
+def differences(previous: Any, current: Any) -> list[str]:
     """Compare two specs.
 
     Args:
-      saved: First spec, as JSON.
+      previous: First spec, as JSON.
       current: Second spec, as JSON.
 
     Returns:
       One line for each field in which they differ.
     """
-    saved, current = dict(_leaves(saved, "spec")), dict(_leaves(current, "spec"))
+    previous, current = dict(_leaves(previous, "spec")), dict(_leaves(current, "spec"))
     lines = []
-    for path in {**saved, **current}:
-        before, now = saved.get(path, "absent"), current.get(path, "absent")
+    for path in {**previous, **current}:
+        before, now = previous.get(path, "absent"), current.get(path, "absent")
         if before != now:
             lines.append(f"{path}: saved {before}, now {now}")
     return lines
@@ -353,9 +353,9 @@ def _default_of_absent(spec, name):
 def _read(kind, text, path):
     options = typing.get_args(kind)
     choices = [option for option in options if dataclasses.is_dataclass(option)]
-    named = {choice.__name__: choice for choice in choices}
-    if text in named:
-        return _defaults(named[text], path)
+    classes = {choice.__name__: choice for choice in choices}
+    if text in classes:
+        return _defaults(classes[text], path)
     origin = typing.get_origin(kind)
     item_types = typing.get_args(options[0]) if origin is tuple else ()
     protocols = _protocols(item_types or options)
@@ -382,8 +382,8 @@ def _read(kind, text, path):
             return tuple(item(part) for part in text.split(",") if part)
     except ValueError:
         pass
-    if named:
-        kind = f"one of {', '.join([*named, *['MODULE:NAME'] * bool(protocols)])}"
+    if classes:
+        kind = f"one of {', '.join([*classes, *['MODULE:NAME'] * bool(protocols)])}"
     raise OverrideError(f"{path}={text}: cannot be read as {kind}")
 
 
@@ -404,14 +404,14 @@ def _load(name, protocols, path):
 
 def _defaults(spec_class, path):
     """Make a spec with the defaults of all its fields."""
-    required = [
+    required_names = [
         field.name
         for field in dataclasses.fields(spec_class)
         if field.default is field.default_factory is dataclasses.MISSING
     ]
-    if required:
+    if required_names:
         raise OverrideError(
             f"{path}: {spec_class.__name__} has no defaults for "
-            f"{' and '.join(required)}; choose a preset that has it"
+            f"{' and '.join(required_names)}; choose a preset that has it"
         )
     return spec_class()

@@ -18,7 +18,7 @@ def steps(default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={_MARK: True})
 
 
-def stretched(spec: Any, share: float) -> Any:
+def scale_steps(spec: Any, share: float) -> Any:
     """Scale every step count of a spec, also in nested specs.
 
     Args:
@@ -37,5 +37,5 @@ def stretched(spec: Any, share: float) -> Any:
             unit = 10 if value % 10 == 0 and value * share >= 100 else 1
             changes[field.name] = max(1, unit * round(value * share / unit))
         elif dataclasses.is_dataclass(value):
-            changes[field.name] = stretched(value, share)
+            changes[field.name] = scale_steps(value, share)
     return dataclasses.replace(spec, **changes)

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from nerfies_jax.geometry.precision import exact_product
-from nerfies_jax.training.fit import Fit, check_positive, counted
+from nerfies_jax.training.fit import Fit, as_int32, check_positive
 
 PyTree = Any
 Vector = Float[Array, "3"]
@@ -80,22 +80,22 @@ def inverse_warp(
         start = _continuation(displace, *frozen, spec.continuation)
     start = lax.stop_gradient(start)
     root, steps = _newton(displace, *frozen, start, spec)
-    converged = _is_valid_root(displace, *frozen, root, spec)
+    is_converged = _is_valid_root(displace, *frozen, root, spec)
     if spec.reach:
         directions = jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(root.dtype)
         others = jax.vmap(
             lambda axis: _newton(displace, *frozen, root + spec.reach * axis, spec)[0]
         )(directions)
-        solved = jax.vmap(lambda x: _is_root(displace, *frozen, x, spec))(others)
+        is_root = jax.vmap(lambda x: _is_root(displace, *frozen, x, spec))(others)
         distinct = jnp.max(jnp.abs(others - root), axis=-1) > spec.reach / 100
-        converged &= ~jnp.any(solved & distinct)
-    value = _implicit(displace, params, canonical_point, root, converged)
+        is_converged &= ~jnp.any(is_root & distinct)
+    value = _implicit(displace, params, canonical_point, root, is_converged)
     # Without a root the initial guess is better, because Newton's method may have
     # diverged. A root that is folded or not unique is kept. Its residual is small.
     root = jnp.where(_is_root(displace, *frozen, root, spec), root, start)
-    value = jnp.where(converged, value, root)
+    value = jnp.where(is_converged, value, root)
     residual = _norm(_excess(displace, *frozen, lax.stop_gradient(value)))
-    return Fit(value, converged, steps, residual)
+    return Fit(value, is_converged, steps, residual)
 
 
 class Tracks(NamedTuple):
@@ -153,10 +153,10 @@ def point_tracks(
         if row is None:
             canonical = point
             fit = inverse_warp(displace_at, (params, reference), canonical, spec=spec)
-            middle, converged = fit.value, fit.converged
+            middle, is_converged = fit.value, fit.converged
         else:
             canonical = point + displace(params, point, reference)
-            middle, converged = point, jnp.all(jnp.isfinite(canonical))
+            middle, is_converged = point, jnp.all(jnp.isfinite(canonical))
 
         def advance(position, condition):
             fit = inverse_warp(
@@ -169,7 +169,7 @@ def point_tracks(
         _, (forward, forward_known) = lax.scan(advance, middle, after)
         return Tracks(
             jnp.concatenate([backward[::-1], middle[None], forward]),
-            jnp.concatenate([backward_known[::-1], converged[None], forward_known]),
+            jnp.concatenate([backward_known[::-1], is_converged[None], forward_known]),
         )
 
     return jax.vmap(track)(points)
@@ -191,8 +191,8 @@ def _is_root(displace, params, canonical_point, point, spec):
 
 def _is_valid_root(displace, params, canonical_point, point, spec):
     grads = jnp.eye(3, dtype=point.dtype) + jax.jacfwd(displace, 1)(params, point)
-    unfolded = exact_product(grads[0], jnp.cross(grads[1], grads[2])) > 0
-    return unfolded & _is_root(displace, params, canonical_point, point, spec)
+    is_unfolded = exact_product(grads[0], jnp.cross(grads[1], grads[2])) > 0
+    return is_unfolded & _is_root(displace, params, canonical_point, point, spec)
 
 
 def _newton(displace, params, canonical_point, start, spec):
@@ -206,7 +206,7 @@ def _newton(displace, params, canonical_point, start, spec):
         max_steps=spec.max_steps,
         throw=False,
     )
-    return lax.stop_gradient(solution.value), counted(solution.stats["num_steps"])
+    return lax.stop_gradient(solution.value), as_int32(solution.stats["num_steps"])
 
 
 def _continuation(displace, params, canonical_point, steps):
@@ -224,7 +224,7 @@ def _continuation(displace, params, canonical_point, steps):
     return lax.scan(step, canonical_point, factors)[0]
 
 
-def _implicit(displace, params, canonical_point, root, converged):
+def _implicit(displace, params, canonical_point, root, is_converged):
     """Make one more Newton step from `root`, with the derivatives of the inverse.
 
     Without convergence the equation is replaced by x = root, whose Jacobian is the
@@ -234,7 +234,7 @@ def _implicit(displace, params, canonical_point, root, converged):
 
     def equation(point, inputs):
         excess = _excess(displace, *inputs, point)
-        return jnp.where(converged, excess, point - root)
+        return jnp.where(is_converged, excess, point - root)
 
     return optimistix.root_find(
         equation,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Key
 from nerfies_jax.training import programs
 
 PyTree = Any
-LAST_RATE = 0.02  # last over first learning rate in `descended`
+LAST_RATE = 0.02  # last over first learning rate in `minimize`
 
 
 def apply_updates(params: PyTree, updates: PyTree, learning_rates: PyTree) -> PyTree:
@@ -36,7 +36,7 @@ def apply_updates(params: PyTree, updates: PyTree, learning_rates: PyTree) -> Py
     return jax.tree.map(update_group, learning_rates, params, updates)
 
 
-def descended(
+def minimize(
     loss: Callable[[PyTree, Key[Array, ""]], Array],
     start: PyTree,
     rates: PyTree,
@@ -61,11 +61,11 @@ def descended(
     # Numbers and arrays of the capture are arguments, so that other captures reuse the
     # compiled program.
     @jax.jit
-    def run(params, rates, key, captured):
+    def run(params, rates, key, constants):
         def step(state, key_and_count):
             params, moments = state
             key, count = key_and_count
-            grads = jax.grad(lambda params: separate(captured, params, key))(params)
+            grads = jax.grad(lambda params: separate(constants, params, key))(params)
             updates, moments = adam.update(grads, moments)
             decay = LAST_RATE ** (count.astype(jnp.result_type(float)) / steps)
             step_rates = jax.tree.map(lambda rate: rate * decay, rates)
@@ -77,5 +77,5 @@ def descended(
 
     # optax raises floats to an integer number of steps.
     with jax.numpy_dtype_promotion("standard"):
-        separate, captured = programs.with_captured(loss, start, key)
-        return run(start, rates, key, captured)
+        separate, constants = programs.with_captured(loss, start, key)
+        return run(start, rates, key, constants)

@@ -74,7 +74,7 @@ def test_annealing_counts_steps_beyond_the_integers_of_float32(dtype):
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_a_run_of_a_few_steps_may_have_no_step_to_anneal_in(steps):
-    short = step_counts.stretched(ANNEALING, steps / 1000)
+    short = step_counts.scale_steps(ANNEALING, steps / 1000)
     schedule = jitted(phases.annealed(MAIN, short, steps))
     for step in range(steps):  # 5 % of these are none to freeze
         assert float(schedule(step)) == float(MAIN(step))
