@@ -320,7 +320,7 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     """
     preprocessed = record.cached(capture, CACHE / "evidence")
     reason = usable_paths.unusable(preprocessed)
-    static = bool(reason) and usable_paths.stands_still(preprocessed, capture.times)
+    static = bool(reason) and usable_paths.is_static(preprocessed, capture.times)
     inspected = preprocessed.unusable or (reason and not static)
     inspection_result = _findings(capture, preprocessed) if inspected else ()
     motion = next((one for one in inspection_result if one.effect == MOTION), None)

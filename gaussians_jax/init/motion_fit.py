@@ -53,7 +53,7 @@ RIDGE = 1e-9  # of the trace, for directions of a basis that have no effect
 class Resting(NamedTuple):
     """Points that are known to be static, with the motion's parameters for each."""
 
-    position: Float[Array, "still 3"]  # scene units
+    position: Float[Array, "static 3"]  # scene units
     rows: PyTree  # per-Gaussian parameters of the motion, or None
 
 
@@ -73,7 +73,7 @@ class Paths(NamedTuple):
     position: Float[np.ndarray, "points frames 3"]  # scene units
     known: Bool[np.ndarray, "points frames"]
     unit: float  # a typical distance in the scene, scene units
-    still: Float[np.ndarray, "still 3"] | None = None  # static points, scene units
+    static: Float[np.ndarray, "static 3"] | None = None  # static points, scene units
     depth: "Depth | None" = None  # None: equally accurate in all directions
 
 
@@ -143,7 +143,7 @@ def along(deviation: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points
     return np.clip((deviation / ALL_TRACKS) ** 2, LEAST_ALONG, 1.0)
 
 
-def resting(paths: Paths) -> Float[Array, "still 3"] | None:
+def resting(paths: Paths) -> Float[Array, "static 3"] | None:
     """Sample static points in scene units. None if none are known.
 
     Args:
@@ -152,10 +152,10 @@ def resting(paths: Paths) -> Float[Array, "still 3"] | None:
     Returns:
       At most `RESTING` points, in units of the capture.
     """
-    if paths.still is None or not len(paths.still):
+    if paths.static is None or not len(paths.static):
         return None
-    sample = np.random.default_rng(0).permutation(len(paths.still))[:RESTING]
-    return captured(paths.still[sample])
+    sample = np.random.default_rng(0).permutation(len(paths.static))[:RESTING]
+    return captured(paths.static[sample])
 
 
 def rest_loss(

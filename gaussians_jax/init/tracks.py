@@ -83,7 +83,7 @@ def start(
     paths = usable_paths.known_paths(evidence)
     times = capture.times[evidence.row].astype(np.float32)
     unit = usable_paths.scene_unit(evidence)
-    static_points = np.asarray(evidence.still.position, np.float32)
+    static_points = np.asarray(evidence.static_cloud.position, np.float32)
     views = view_set.in_time_order(record.downscale(capture, evidence.factor))
     ray = paths.position - views.position
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)

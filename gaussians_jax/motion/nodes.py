@@ -369,8 +369,8 @@ def fit_to_paths(
     canonical = motion_fit.positions_at_middle(paths)
     unit = motion_fit.captured(paths.unit)
     static_points = np.zeros((0, 3))
-    if paths.still is not None:
-        static_points = np.asarray(paths.still, np.float64)
+    if paths.static is not None:
+        static_points = np.asarray(paths.static, np.float64)
     moving = (
         spec.nodes if not len(static_points) else round(spec.moving_share * spec.nodes)
     )

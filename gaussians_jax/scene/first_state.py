@@ -132,8 +132,8 @@ def _from_tracks(spec, effects, capture, key):
     if tracking is None:
         return None, None, capture
     seeds = track_start.start(spec.start, effects[0], tracking, capture, key)
-    if len(tracking.still.position) > initialization.point_count(capture):
-        capture = dataclasses.replace(capture, points=tracking.still)
+    if len(tracking.static_cloud.position) > initialization.point_count(capture):
+        capture = dataclasses.replace(capture, points=tracking.static_cloud)
     hidden = None
     if spec.start.fill_hidden and initialization.point_count(capture):
         views = view_set.in_time_order(record.downscale(capture, tracking.factor))

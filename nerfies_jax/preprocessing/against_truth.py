@@ -123,9 +123,12 @@ def _path_error(capture, views, evidence, tracks, points):
     tracks = tracks.take(long)
     if not long.any():
         return np.nan
-    static = evidence.score < paths.AT_REST
+    static = evidence.score < paths.STATIC_SCORE
     around = paths.depth_around(
-        tracks, evidence.tracks.take(static), evidence.rest.take(static), capture.near
+        tracks,
+        evidence.tracks.take(static),
+        evidence.static_fit.take(static),
+        capture.near,
     )
     solution = paths.least_acceleration(views, tracks, capture.near, around)
     error = np.linalg.norm(solution.position - points.position[long], axis=-1)

@@ -11,7 +11,7 @@ MOVING = np.array([255, 40, 40])
 # Number of frames, minimum width in px, and number of recent positions of a track.
 FOLLOWED, DRAWN_WIDTH, TAIL = 8, 352, 8
 TRACKS = 250  # maximum number of tracks in a frame
-AT_REST, BY_ITSELF = (150, 200, 255), (255, 230, 0)
+STATIC, BY_ITSELF = (150, 200, 255), (255, 230, 0)
 
 
 def followed(views: Views, evidence: Evidence) -> np.ndarray:
@@ -48,7 +48,7 @@ def followed(views: Views, evidence: Evidence) -> np.ndarray:
 
 def _draw_tracks(image, evidence, frame, times):
     static = evidence.tracks.take(evidence.score <= MOVES)
-    for tracks, color in ((static, AT_REST), (evidence.path_tracks, BY_ITSELF)):
+    for tracks, color in ((static, STATIC), (evidence.path_tracks, BY_ITSELF)):
         rows = np.flatnonzero(tracks.visible[:, frame])
         for row in _spread(rows, TRACKS // 2):
             tail = np.arange(max(0, frame - TAIL), frame + 1)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from nerfies_jax.preprocessing import rigid_groups
 from nerfies_jax.preprocessing.paths import Paths
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views, in_image, project
 
@@ -46,7 +46,7 @@ def scaled(
     measured: np.ndarray,
     alone: Paths,
     static: Tracks,
-    rest: RestPoints,
+    static_fit: StaticPoints,
     deviation: float,
 ) -> BodyDepth:
     """Find the factor of each body between external depth and its depth in the scene.
@@ -58,14 +58,14 @@ def scaled(
         frames], NaN if unknown.
       alone: Paths of the tracks without the external depth.
       static: Static tracks.
-      rest: Their points.
+      static_fit: Their points.
       deviation: Relative deviation of the external depth at static points.
 
     Returns:
       The scaled depth.
     """
     body = _bodies(tracks, measured, alone)
-    bound = _bounds(views, tracks, measured, static, rest)
+    bound = _bounds(views, tracks, measured, static, static_fit)
     prior = max(BODY_DEVIATION * deviation, LEAST_DEVIATION)
     count = len(measured)
     factor, spread = np.ones(count), np.full(count, prior)
@@ -98,7 +98,7 @@ def _bodies(tracks, depth, alone):
     return body
 
 
-def _bounds(views, tracks, external_depth, static, rest):
+def _bounds(views, tracks, external_depth, static, static_fit):
     """Largest factors with which tracks are in front of the static points they hide.
 
     Static points that project to a moving track, but are not visible there, are hidden.
@@ -107,8 +107,8 @@ def _bounds(views, tracks, external_depth, static, rest):
       Ratios of depths [tracks, frames], NaN where no static point is hidden.
     """
     bound = np.full(external_depth.shape, np.nan)
-    stride = -(-len(rest.position) // MOST_POINTS) or 1
-    points, visible = rest.position[::stride], static.visible[::stride]
+    stride = -(-len(static_fit.position) // MOST_POINTS) or 1
+    points, visible = static_fit.position[::stride], static.visible[::stride]
     for frame in range(external_depth.shape[1]):
         here = np.flatnonzero(tracks.visible[:, frame] & (external_depth[:, frame] > 0))
         pixel, depth = project(views, frame, points)

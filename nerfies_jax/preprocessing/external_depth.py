@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 
 FEWEST = 12  # static points in an image
@@ -55,7 +55,7 @@ class AlignedDepth(NamedTuple):
 def aligned(
     depth: np.ndarray,
     tracks: Tracks,
-    rest: RestPoints,
+    static_fit: StaticPoints,
     inverse: bool | None = None,
 ) -> AlignedDepth:
     """Align depth to static points.
@@ -63,14 +63,14 @@ def aligned(
     Args:
       depth: External depth or inverse depth, [frames, height, width].
       tracks: Tracks of static points, in the pixels of `depth`.
-      rest: Static points of the tracks.
+      static_fit: Static points of the tracks.
       inverse: True for inverse depth, False for depth. None for the one that fits.
 
     Returns:
       The aligned depth.
     """
     kinds = (False, True) if inverse is None else (inverse,)
-    results = [_align(depth, tracks, rest, kind) for kind in kinds]
+    results = [_align(depth, tracks, static_fit, kind) for kind in kinds]
     best = results[0]
     for other in results[1:]:
         if other.total_miss + SAME < best.total_miss:
@@ -78,15 +78,15 @@ def aligned(
     return best
 
 
-def _align(depth, tracks, rest, inverse):
+def _align(depth, tracks, static_fit, inverse):
     result = np.full(depth.shape, np.nan, np.float32)
     misses = np.full(len(depth), np.nan)
     fits = []
     tilt = _tilt(depth.shape[1:])
     for frame, external in enumerate(depth):
-        usable = tracks.visible[:, frame] & (rest.depth[:, frame] > 0)
+        usable = tracks.visible[:, frame] & (static_fit.depth[:, frame] > 0)
         place = pixel_of(tracks.pixel[usable, frame], external.shape)
-        own, true = external[place].astype(np.float64), rest.depth[usable, frame]
+        own, true = external[place].astype(np.float64), static_fit.depth[usable, frame]
         finite = np.isfinite(own)
         if finite.sum() < FEWEST:
             continue

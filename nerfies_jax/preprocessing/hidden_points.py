@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.view_set import Views
 FRAMES = 12  # used frames, evenly spaced over the video
 # In pixels of reduced images, more in larger images.
 EVERY_PX = 2
-# A pixel nearer to a known point shows this point. `still_points` has one for every
+# A pixel nearer to a known point shows this point. `dense_points` has one for every
 # second pixel of each of twelve frames, fewer in regions with little texture.
 KNOWN_PX = 6.0
 AROUND = 32  # cells of that size with known points, around a pixel
@@ -26,7 +26,7 @@ BEFORE, ROUNDS = 0.03, 8  # relative depth by which points in front are excluded
 RIDGE_PX = 4.0
 
 
-def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
+def behind(views: Views, static_cloud: PointCloud, moving: np.ndarray) -> PointCloud:
     """Place colored points on moving pixels far from any known point. Runs on the host.
 
     Each frame counts the points of the frames before as known. A frame in which points
@@ -34,13 +34,13 @@ def behind(views: Views, still: PointCloud, moving: np.ndarray) -> PointCloud:
 
     Args:
       views: The frames.
-      still: Known static points.
+      static_cloud: Known static points.
       moving: True for moving pixels, [frames, height, width].
 
     Returns:
       The additional points.
     """
-    places, colors = np.asarray(still.position, np.float64), still.color
+    places, colors = np.asarray(static_cloud.position, np.float64), static_cloud.color
     first = len(places)
     frames = np.linspace(0, len(views.row) - 1, min(FRAMES, len(views.row)))
     for frame in np.unique(frames.round().astype(int)).tolist():

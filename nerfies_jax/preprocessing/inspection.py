@@ -126,7 +126,7 @@ def _read(capture, folder):
     points = view_set.own_points(small)
     static = points
     if not len(points) and not evidence.unusable:
-        static = view_set.some(evidence.still.position)
+        static = view_set.some(evidence.static_cloud.position)
     views = view_set.in_time_order(small)
     return _Read(capture, small, views, evidence, points, static)
 

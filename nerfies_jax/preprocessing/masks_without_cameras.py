@@ -17,7 +17,7 @@ from nerfies_jax.capture import frames
 from nerfies_jax.capture import images as image_files
 from nerfies_jax.preprocessing import dense_flow, moving, view_set
 from nerfies_jax.preprocessing import tracks as tracking
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.runtime import events
 
 LATER = (6, 10, 15)  # distances in frames over which tracks are compared
@@ -44,7 +44,7 @@ def _moving_masks(images: np.ndarray) -> np.ndarray:
     valid = np.isfinite(off).any(1)
     tracks, off = tracks.take(valid), off[valid]
     point_fields = np.zeros((len(off), 3)), off, np.zeros_like(off)
-    score = moving.track_scores(tracks, RestPoints(*point_fields))
+    score = moving.track_scores(tracks, StaticPoints(*point_fields))
     share = moving.votes(views, tracks, score)
     moves = moving.mask(views, share, np.zeros_like(share))
     width, height = whole.size

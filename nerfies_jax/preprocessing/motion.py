@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from nerfies_jax.preprocessing import feature_matches, outlines, record, rest_points
+from nerfies_jax.preprocessing import feature_matches, outlines, record, static_points
 from nerfies_jax.preprocessing.findings import (
     CANNOT_TELL,
     CERTAIN,
@@ -79,7 +79,7 @@ def _flow_fails(views, evidence):
         return True
     if record.carried(views, evidence.flow) < CARRIED_FOR_NO:
         return True
-    return rest_noise(evidence) <= CALM_PX and moving_share(evidence) < MOVING_SHARE
+    return static_noise(evidence) <= CALM_PX and moving_share(evidence) < MOVING_SHARE
 
 
 def _by_features(views, finding):
@@ -111,7 +111,7 @@ def _threshold():
 
 def _by_tracks(views, evidence):
     shares, share = frame_shares(evidence), moving_share(evidence)
-    masked_share, noise = float(evidence.moving.mean()), rest_noise(evidence)
+    masked_share, noise = float(evidence.moving.mean()), static_noise(evidence)
     error = FALSE_SHARE * max(1.0, noise / CALM_PX) ** 2
     moves, confidence = judge(share, MOVING_SHARE, error)
     reason = _why_not_no(views, evidence, noise) if moves is False else None
@@ -168,7 +168,7 @@ def moving_share(evidence: Evidence) -> float:
     return float(length[evidence.score > MOVES].sum() / max(length.sum(), 1))
 
 
-def rest_noise(evidence: Evidence) -> float:
+def static_noise(evidence: Evidence) -> float:
     """Compute the median reprojection error of static tracks.
 
     Args:
@@ -180,7 +180,7 @@ def rest_noise(evidence: Evidence) -> float:
     static = evidence.score < MOVES
     if not static.any():
         return np.inf
-    return float(np.median(rest_points.miss(evidence.rest.take(static))))
+    return float(np.median(static_points.miss(evidence.static_fit.take(static))))
 
 
 def _why_not_no(views, evidence, noise):

@@ -5,8 +5,8 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
-from nerfies_jax.preprocessing import rest_points
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing import static_points
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 from nerfies_jax.preprocessing.view_set import Views
 
@@ -15,7 +15,7 @@ HALF_CERTAIN_PX, STEEPNESS = 0.5, 3.0
 # Cameras of real videos have errors of about a pixel, so the error above is at least
 # this multiple of the error of the best quarter of the tracks. Without it, 21 % of a
 # video of a hand in front of books are classified as moving, with it 7 % (the hand).
-STILLEST, OVER_NOISE = 0.25, 3.0
+BEST_QUANTILE, OVER_NOISE = 0.25, 3.0
 # Tracks that are near each other in common frames have similar scores.
 NEIGHBORS, EVERY_FRAMES, NEAR_PX, NEIGHBOR_WEIGHT, ROUNDS = 10, 6, 6.0, 3.0, 10
 # The score of a pixel is that of tracks at similar positions and colors. Pixels far
@@ -31,13 +31,13 @@ SMOOTH_REACH, SMOOTH_PX, SMOOTH_COLOR = 4, 3.0, 15.0
 
 
 def track_scores(
-    tracks: Tracks, rest: RestPoints, noise_tracks: int | None = None
+    tracks: Tracks, static_fit: StaticPoints, noise_tracks: int | None = None
 ) -> np.ndarray:
     """Estimate the confidence that each track moves.
 
     Args:
       tracks: The tracks.
-      rest: The static points that fit them best.
+      static_fit: The static points that fit them best.
       noise_tracks: Number of tracks, the first ones, that begin anywhere and determine
         the noise. None for all.
 
@@ -47,8 +47,10 @@ def track_scores(
     count = len(tracks.visible)
     if count == 0:
         return np.zeros(0)
-    far = rest_points.miss(rest)
-    half = max(HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far[:noise_tracks], STILLEST))
+    far = static_points.miss(static_fit)
+    half = max(
+        HALF_CERTAIN_PX, OVER_NOISE * np.quantile(far[:noise_tracks], BEST_QUANTILE)
+    )
     with np.errstate(divide="ignore"):
         odds = STEEPNESS * np.log(np.maximum(far, 1e-3) / half)
     probability = 1 / (1 + np.exp(-np.minimum(odds, 50)))

@@ -6,17 +6,17 @@ import scipy.ndimage as nd
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing import (
+    dense_points,
     external_bodies,
     external_depth,
     external_resampling,
     paths,
     rigid_bodies,
-    still_points,
 )
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.external_depth import AlignedDepth
 from nerfies_jax.preprocessing.paths import Paths
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import A_BODY_TERM, A_PATH_FRAME, Watch
@@ -34,7 +34,7 @@ def known(
     capture: Capture,
     external: ExternalResults,
     views: Views,
-    static: tuple[Tracks, RestPoints],
+    static: tuple[Tracks, StaticPoints],
     use_depths: bool,
 ) -> AlignedDepth | None:
     """Return the depth maps that constrain paths, in scene units.
@@ -59,8 +59,8 @@ def known(
             return None
         exact = np.zeros(len(views.row))
         return AlignedDepth(capture.depths[views.row], exact, 0.0)
-    tracks, rest = _well_placed(views, *static)
-    aligned_depth = external_depth.aligned(depth, tracks, rest, external.inverse)
+    tracks, static_fit = _well_placed(views, *static)
+    aligned_depth = external_depth.aligned(depth, tracks, static_fit, external.inverse)
     miss, name = aligned_depth.total_miss, capture.path or capture.name
     if not np.isfinite(miss):
         kinds = {
@@ -81,19 +81,19 @@ def known(
     return aligned_depth
 
 
-def _well_placed(views, tracks, rest):
+def _well_placed(views, tracks, static_fit):
     """Return the static points whose depth is certain, or all if they are few."""
-    sure = still_points.depth_deviation(views, tracks, rest) < SURE_DEPTH
+    sure = dense_points.depth_deviation(views, tracks, static_fit) < SURE_DEPTH
     if (tracks.visible[sure].sum(0) >= external_depth.FEWEST).mean() < MOST_FRAMES_SURE:
-        return tracks, rest
-    return tracks.take(sure), rest.take(sure)
+        return tracks, static_fit
+    return tracks.take(sure), static_fit.take(sure)
 
 
 def fitted(
     capture: Capture,
     views: Views,
     moving: Tracks,
-    static: tuple[Tracks, RestPoints],
+    static: tuple[Tracks, StaticPoints],
     depths: AlignedDepth | None,
     watch: Watch,
     least_known: int = rigid_bodies.LEAST_KNOWN,
@@ -134,8 +134,10 @@ def fitted(
         )
     watch.spend(1e-6 * A_PATH_FRAME * moving.visible.size)
     miss = external_depth.PER_MEDIAN * depths.total_miss
-    near, rest = _well_placed(views, *static)
-    bodies = external_bodies.scaled(views, moving, track_depth, alone, near, rest, miss)
+    near, static_fit = _well_placed(views, *static)
+    bodies = external_bodies.scaled(
+        views, moving, track_depth, alone, near, static_fit, miss
+    )
     smooth = paths.least_acceleration(
         views, moving, least, around, bodies.depth, deviation
     )

@@ -14,7 +14,7 @@ import scipy.linalg
 from scipy.spatial import cKDTree
 
 from nerfies_jax.geometry.rays import across_ray
-from nerfies_jax.preprocessing.rest_points import RestPoints, track_rays
+from nerfies_jax.preprocessing.static_points import StaticPoints, track_rays
 from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
@@ -30,7 +30,7 @@ TRIED = 300  # tracks for choosing the penalty of a video
 AROUND_DEVIATION = 0.5
 MEASURED_DEVIATION = 0.03  # of depths stored with the capture
 AROUND = 8  # static tracks that determine the depth of the surroundings
-AT_REST = 0.3  # tracks with a lower score are static
+STATIC_SCORE = 0.3  # tracks with a lower score are static
 NO_DEPTH = 1e-9  # scene units, because unconstrained paths end in the camera
 SHORTEST_STEP = 0.1  # of the median time between frames, for frames at the same time
 
@@ -231,14 +231,14 @@ def _solve(blocks, bands, right):
 
 
 def depth_around(
-    tracks: Tracks, still: Tracks, rest: RestPoints, near: float
+    tracks: Tracks, static: Tracks, static_fit: StaticPoints, near: float
 ) -> np.ndarray:
     """Compute the median z-depth of the nearest static tracks.
 
     Args:
       tracks: Moving tracks.
-      still: Static tracks.
-      rest: Points of the static tracks.
+      static: Static tracks.
+      static_fit: Points of the static tracks.
       near: Least z-depth in scene units.
 
     Returns:
@@ -246,11 +246,13 @@ def depth_around(
     """
     depth = np.full(tracks.visible.shape, np.nan)
     for frame in range(tracks.visible.shape[1]):
-        here = np.flatnonzero(still.visible[:, frame] & (rest.depth[:, frame] > near))
+        here = np.flatnonzero(
+            static.visible[:, frame] & (static_fit.depth[:, frame] > near)
+        )
         rows = np.flatnonzero(tracks.visible[:, frame])
         if len(here) < AROUND or not len(rows):
             continue
-        tree = cKDTree(still.pixel[here, frame])
+        tree = cKDTree(static.pixel[here, frame])
         _, nearest = tree.query(tracks.pixel[rows, frame], AROUND)
-        depth[rows, frame] = np.median(rest.depth[here, frame][nearest], axis=1)
+        depth[rows, frame] = np.median(static_fit.depth[here, frame][nearest], axis=1)
     return depth

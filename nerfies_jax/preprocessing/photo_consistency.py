@@ -28,22 +28,23 @@ STEEPNESS, MOST = 2.0, 3.0  # of log odds
 OUTSIDE = (np.nan,) * 3
 
 
-def log_odds(views: Views, still: PointCloud) -> np.ndarray:
+def log_odds(views: Views, static_cloud: PointCloud) -> np.ndarray:
     """Compute the log odds that a pixel moves, from colors.
 
     Args:
       views: The frames.
-      still: Static points, none of them near pixels that may move.
+      static_cloud: Static points, none of them near pixels that may move.
 
     Returns:
       Log odds [frames, height, width], 0 if unknown.
     """
     frames = len(views.row)
-    if not len(still.position):
+    if not len(static_cloud.position):
         return np.zeros(views.gray.shape, np.float32)
     color, spread = _normalize(views)
     depth = [
-        _depth(views, frame, still.position.astype(float)) for frame in range(frames)
+        _depth(views, frame, static_cloud.position.astype(float))
+        for frame in range(frames)
     ]
     all_odds = np.zeros(views.gray.shape, np.float32)
     for frame in range(frames):

@@ -20,16 +20,16 @@ from nerfies_jax.capture.capture import Capture, CaptureError, PointCloud
 from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing import (
     dense_flow,
+    dense_points,
     external_depth,
     external_resampling,
     lost_regions,
     patch_alignment,
     path_depths,
     paths,
-    rest_points,
     segmentation,
     short_tracks,
-    still_points,
+    static_points,
     view_set,
 )
 from nerfies_jax.preprocessing import tracks as tracking
@@ -121,12 +121,14 @@ def _gather(capture, use_depths, rough_cameras, masks_only, watch):
     watch.spend(every / 2 if few else 0.0)
     starts = tracking.grid(views, 2 if few else 1)
     tracks, first = _tracks(external, views, flow, images, starts, least)
-    rest = rest_points.fit(views, tracks)
+    static_fit = static_points.fit(views, tracks)
     watch.begin("moving")
     unusable = _unusable(views, flow)
     lengths = None if unusable or first else least
     mask = external_resampling.moving(external, views)
-    moves = segmentation.segmented(views, flow, tracks, rest, lengths, watch, mask)
+    moves = segmentation.segmented(
+        views, flow, tracks, static_fit, lengths, watch, mask
+    )
     score = moves.score
     watch.begin("paths")
     path_tracks = tracks.take(slice(0))
@@ -137,30 +139,30 @@ def _gather(capture, use_depths, rough_cameras, masks_only, watch):
         watch.spend(1e-6 * A_PATCH_FRAME * path_tracks.visible.size)
         path_tracks = patch_alignment.align(path_tracks, images, views.size)
         path_tracks = path_tracks.take(_are_long(path_tracks, least.path))
-    static_rows = np.flatnonzero(score < paths.AT_REST)
-    static = tracks.take(static_rows), rest.take(static_rows)
+    static_rows = np.flatnonzero(score < paths.STATIC_SCORE)
+    static = tracks.take(static_rows), static_fit.take(static_rows)
     depths = path_depths.known(capture, external, views, static, use_depths)
     moved_paths = path_depths.fitted(
         capture, views, path_tracks, static, depths, watch, least.known
     )
-    watch.begin("still")
+    watch.begin("static")
     dense = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    points_work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    points_work = 1e-6 * A_POINT_FRAME * dense_points.work(views)
     if not masks_only and watch.has_room(
         FOR_POINTS, "dense static points", points_work
     ):
-        dense = still_points.dense(views, flow, moves.mask)
+        dense = dense_points.dense(views, flow, moves.mask)
     return Evidence(
         row=views.row,
         flow=_round_flow(flow),
         moving=moves.mask,
         tracks=tracks,
         score=score,
-        rest=rest,
+        static_fit=static_fit,
         path_tracks=path_tracks,
         paths=moved_paths,
         least_known=least.known,
-        still=dense,
+        static_cloud=dense,
         unusable=unusable,
         is_external=external.moving is not None or external.track_pixel is not None,
         factor=factor,

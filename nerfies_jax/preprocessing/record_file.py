@@ -12,7 +12,7 @@ from nerfies_jax.capture.capture import Capture, PointCloud
 from nerfies_jax.capture.external import ExternalResults
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
 from nerfies_jax.preprocessing.paths import Paths
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
@@ -27,11 +27,11 @@ class Evidence(NamedTuple):
     moving: np.ndarray  # [frames, height, width] bool
     tracks: Tracks
     score: np.ndarray  # [tracks] in [0, 1], confidence that the point moves
-    rest: RestPoints  # static point that explains each track best
+    static_fit: StaticPoints  # static point that explains each track best
     path_tracks: Tracks  # of the paths, aligned
     paths: Paths
     least_known: int  # minimum number of frames in which a usable path is known
-    still: PointCloud  # dense static points
+    static_cloud: PointCloud  # dense static points
     unusable: str  # reason why tracking failed, or empty
     # True if masks or tracks are external, so that even few of them are trusted
     is_external: bool
@@ -47,9 +47,9 @@ RECORDS: dict[str, type[NamedTuple]] = {
     "flow": NeighborFlow,
     "tracks": Tracks,
     "path_tracks": Tracks,
-    "rest": RestPoints,
+    "static_fit": StaticPoints,
     "paths": Paths,
-    "still": PointCloud,
+    "static_cloud": PointCloud,
     "seconds": Seconds,
 }
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from nerfies_jax.preprocessing import body_scale, bundle, rigid_groups
 from nerfies_jax.preprocessing.bundle import Body
 from nerfies_jax.preprocessing.paths import Paths
-from nerfies_jax.preprocessing.rest_points import track_rays
+from nerfies_jax.preprocessing.static_points import track_rays
 from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 

@@ -3,9 +3,10 @@
 import numpy as np
 
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.preprocessing import rest_points, still_points, view_set
+from nerfies_jax.preprocessing import dense_points, static_points, view_set
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
+from nerfies_jax.preprocessing.dense_points import CENTERS, REACH
 from nerfies_jax.preprocessing.findings import (
     BACKGROUND,
     CERTAIN,
@@ -14,9 +15,8 @@ from nerfies_jax.preprocessing.findings import (
     cannot_tell,
     judge,
 )
-from nerfies_jax.preprocessing.motion import rest_noise
+from nerfies_jax.preprocessing.motion import static_noise
 from nerfies_jax.preprocessing.record import Evidence
-from nerfies_jax.preprocessing.still_points import CENTERS, REACH
 from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
 
 CELLS = (8, 6)  # columns and rows. A cell is covered if it contains a point.
@@ -172,16 +172,16 @@ def _stays(views, evidence, frame, points):
     pixel, depth = view_set.project(views, frame, points)
     rows = np.flatnonzero(view_set.in_image(views, pixel, depth))
     span = slice(max(0, frame - REACH), frame + REACH + 1)
-    near, at = still_points.view_slice(views, span), frame - span.start
+    near, at = dense_points.view_slice(views, span), frame - span.start
     starts = np.concatenate([np.full((len(rows), 1), at), pixel[rows]], axis=-1)
     flow = NeighborFlow(*(part[span] for part in evidence.flow))
     tracks = tracking.chain(flow, starts)
     enough = tracks.visible.sum(1) > min(LEAST_FOLLOWED, len(near.row) - 1)
     rows, tracks = rows[enough], tracks.take(enough)
-    rest = rest_points.fit(near, tracks)
+    static_fit = static_points.fit(near, tracks)
     # One if the point lies on the visible surface.
-    share = depth[rows] / rest.depth[:, at]
-    deep = still_points.depth_deviation(near, tracks, rest) < DEPTH_KNOWN
+    share = depth[rows] / static_fit.depth[:, at]
+    deep = dense_points.depth_deviation(near, tracks, static_fit) < DEPTH_KNOWN
     can_check = ~deep | (share < 1 + DEPTH_AGREES)
     through = deep & (share < 1 - DEPTH_AGREES)
     misses = np.full(tracks.visible.shape, np.nan)
@@ -192,5 +192,5 @@ def _stays(views, evidence, frame, points):
     misses[:, at] = np.nan
     middle = np.nanmedian(misses, axis=1)
     bound = AGREES_PX * view_set.times_smaller(views)
-    bound = max(bound, AGREES_DEVIATIONS * rest_noise(evidence))
+    bound = max(bound, AGREES_DEVIATIONS * static_noise(evidence))
     return rows[can_check], (middle < bound)[can_check] & ~through[can_check]

@@ -13,16 +13,16 @@ import cv2
 import numpy as np
 
 from nerfies_jax.preprocessing import (
+    dense_points,
     moving,
     photo_consistency,
-    rest_points,
-    still_points,
+    static_points,
     view_set,
 )
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
-from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.short_tracks import SHORT, Lengths
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.view_set import Views
 from nerfies_jax.preprocessing.watch import (
@@ -62,7 +62,7 @@ def segmented(
     views: Views,
     flow: NeighborFlow,
     tracks: Tracks,
-    rest: RestPoints,
+    static_fit: StaticPoints,
     lengths: Lengths | None,
     watch: Watch,
     mask: np.ndarray | None = None,
@@ -73,7 +73,7 @@ def segmented(
       views: The frames.
       flow: Their flow.
       tracks: Tracks of a grid, or of the user.
-      rest: The static points that fit them best.
+      static_fit: The static points that fit them best.
       lengths: Minimum lengths of tracks that begin on the mask. None for no such
         tracks.
       watch: Work budget.
@@ -83,7 +83,7 @@ def segmented(
       Pixels and tracks.
     """
     if mask is None:
-        return _by_tracks(views, flow, tracks, rest, lengths, watch)
+        return _by_tracks(views, flow, tracks, static_fit, lengths, watch)
     mask_tracks = tracks.take(slice(0))
     if lengths:
         mask_tracks = _tracks_on(views, flow, mask, lengths, watch)
@@ -91,19 +91,19 @@ def segmented(
     return Moving(mask, score, mask_tracks, mask_score)
 
 
-def _by_tracks(views, flow, tracks, rest, lengths, watch):
+def _by_tracks(views, flow, tracks, static_fit, lengths, watch):
     mask_tracks = tracks.take(slice(0))
-    score = moving.track_scores(tracks, rest)
+    score = moving.track_scores(tracks, static_fit)
     share, colors = _colors(views, flow, tracks, score, watch)
     mask = _mask(views, colors, share)
     for _ in range(ROUNDS if lengths else 0):
         mask_tracks = _tracks_on(views, flow, mask, lengths, watch)
         if not len(mask_tracks.start):
             break
-        points = rest_points.fit(views, mask_tracks)
+        points = static_points.fit(views, mask_tracks)
         all_tracks = tracking.joined([tracks, mask_tracks])
-        all_rest = tracking.joined([rest, points])
-        score = moving.track_scores(all_tracks, all_rest, len(tracks.start))
+        all_fits = tracking.joined([static_fit, points])
+        score = moving.track_scores(all_tracks, all_fits, len(tracks.start))
         mask = _mask(views, colors, _votes(colors, all_tracks, score))
     count, mask_count = len(tracks.start), len(mask_tracks.start)
     return Moving(
@@ -132,12 +132,12 @@ def _colors(views, flow, tracks, score, watch):
     colors = _Colors(view_set.smaller(views, times), times, np.zeros(0))
     share = _votes(colors, tracks, score)
     odds = np.zeros(share.shape, np.float32)
-    work = 1e-6 * A_POINT_FRAME * still_points.work(views)
+    work = 1e-6 * A_POINT_FRAME * dense_points.work(views)
     work += 1e-6 * A_COMPARED_PIXEL * views.valid.size
     if watch.has_room(FOR_COLORS, "colors for detecting moving objects", work):
         may_move = _enlarge(moving.may_move(share), views.size)
-        still = still_points.dense(views, flow, may_move)
-        odds = photo_consistency.log_odds(colors.views, still)
+        static_cloud = dense_points.dense(views, flow, may_move)
+        odds = photo_consistency.log_odds(colors.views, static_cloud)
     return share, colors._replace(odds=odds)
 
 

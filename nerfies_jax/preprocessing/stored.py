@@ -7,7 +7,7 @@ import numpy as np
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry import camera as camera_records
 from nerfies_jax.geometry import lens as lenses
-from nerfies_jax.preprocessing import still_points
+from nerfies_jax.preprocessing import dense_points
 from nerfies_jax.preprocessing.findings import (
     CERTAIN,
     DEPTH,
@@ -17,7 +17,7 @@ from nerfies_jax.preprocessing.findings import (
     cannot_tell,
     judge,
 )
-from nerfies_jax.preprocessing.paths import AT_REST
+from nerfies_jax.preprocessing.paths import STATIC_SCORE
 from nerfies_jax.preprocessing.record import MOVES, Evidence
 from nerfies_jax.preprocessing.tracks import pixel_of
 from nerfies_jax.preprocessing.view_set import MIN_POINTS, Views
@@ -71,14 +71,19 @@ def depth(capture: Capture, views: Views, evidence: Evidence) -> Finding:
 
 def _over_parallax(depths, views, evidence):
     """Return the ratios of stored depth to the depth of static tracks."""
-    static_rows = np.flatnonzero((evidence.score < AT_REST) & (not evidence.unusable))
-    tracks, rest = evidence.tracks.take(static_rows), evidence.rest.take(static_rows)
-    sure = still_points.depth_deviation(views, tracks, rest) < DEPTH_SURE
-    tracks, rest = tracks.take(sure), rest.take(sure)
+    static_rows = np.flatnonzero(
+        (evidence.score < STATIC_SCORE) & (not evidence.unusable)
+    )
+    tracks, static_fit = (
+        evidence.tracks.take(static_rows),
+        evidence.static_fit.take(static_rows),
+    )
+    sure = dense_points.depth_deviation(views, tracks, static_fit) < DEPTH_SURE
+    tracks, static_fit = tracks.take(sure), static_fit.take(sure)
     row, column = pixel_of(tracks.pixel, depths.shape[1:])
     own = depths[np.arange(len(depths)), row, column]
-    is_known = tracks.visible & (own > 0) & (rest.depth > 0)
-    return own[is_known] / rest.depth[is_known]
+    is_known = tracks.visible & (own > 0) & (static_fit.depth > 0)
+    return own[is_known] / static_fit.depth[is_known]
 
 
 def masks(capture: Capture, evidence: Evidence) -> Finding:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerfies_jax.preprocessing import record, rigid_groups, still_points
+from nerfies_jax.preprocessing import dense_points, record, rigid_groups
 from nerfies_jax.preprocessing.record import MOVES, Evidence
 from nerfies_jax.preprocessing.usable_paths import scene_unit
 from nerfies_jax.preprocessing.view_set import Views
@@ -51,8 +51,8 @@ def of(views: Views, evidence: Evidence) -> Summary:
     """
     tracks, paths = evidence.tracks, evidence.paths
     static = np.flatnonzero(evidence.score < MOVES)
-    parallax = still_points.depth_deviation(
-        views, tracks.take(static), evidence.rest.take(static)
+    parallax = dense_points.depth_deviation(
+        views, tracks.take(static), evidence.static_fit.take(static)
     )
     distance = scene_unit(evidence)
     groups, miss = 0, np.nan
@@ -72,7 +72,7 @@ def of(views: Views, evidence: Evidence) -> Summary:
         paths=len(evidence.paths.position),
         path_deviation=_median(paths.depth_deviation),
         rest_deviation=_median(parallax),
-        points=len(evidence.still.position),
+        points=len(evidence.static_cloud.position),
         groups=groups,
         group_miss=miss / distance,
         seconds=sum(evidence.seconds),

@@ -116,7 +116,7 @@ def _is_known(evidence):
     return evidence.paths.known.sum(1) >= evidence.least_known
 
 
-def stands_still(evidence: Evidence, times: np.ndarray) -> bool:
+def is_static(evidence: Evidence, times: np.ndarray) -> bool:
     """Test if the scene is static: it has a single time, or only static tracks.
 
     Args:
@@ -164,6 +164,6 @@ def scene_unit(evidence: Evidence) -> float:
     Returns:
       The distance in scene units, 1 if there are no points.
     """
-    depth = evidence.rest.depth[evidence.tracks.visible]
+    depth = evidence.static_fit.depth[evidence.tracks.visible]
     depth = depth[np.isfinite(depth) & (depth > 0)]
     return float(np.median(depth)) if len(depth) else 1.0

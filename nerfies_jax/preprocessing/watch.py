@@ -34,7 +34,7 @@ class Seconds(NamedTuple):
     tracks: float
     moving: float
     paths: float
-    still: float
+    static: float
 
 
 # Names for the user, by the fields of `Seconds` in their order.
@@ -43,14 +43,14 @@ PARTS = {
     "tracks": "point tracks and static points",
     "moving": "masks of moving objects",
     "paths": "3D paths",
-    "still": "dense static points",
+    "static": "dense static points",
 }
 STAGES = {
     "flow": "optical flow",
     "tracks": "point tracks",
     "moving": "detecting moving objects",
     "paths": "paths of moving points",
-    "still": "dense static points",
+    "static": "dense static points",
 }
 
 

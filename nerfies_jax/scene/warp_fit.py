@@ -45,7 +45,7 @@ class PointPaths(NamedTuple):
     appearance: np.ndarray  # [frames] appearance ids
     position: Float[np.ndarray, "points frames 3"]  # arbitrary if unknown
     known: Bool[np.ndarray, "points frames"]
-    still: Float[np.ndarray, "still 3"]  # static points
+    static: Float[np.ndarray, "static 3"]  # static points
 
 
 class WarpFit(NamedTuple):
@@ -89,7 +89,7 @@ def point_paths(field: Field, capture, evidence: Evidence) -> PointPaths:
         capture.appearance_ids[evidence.row],
         inside(np.where(valid[..., None], position, 0)),
         valid,
-        inside(evidence.still.position),
+        inside(evidence.static_cloud.position),
     )
 
 
@@ -294,7 +294,7 @@ def _sample(paths, frames, key):
     together = min(FRAMES_AT_ONCE, frames)
     frame = jax.random.choice(frame_key, frames, (together,), replace=False)
     rows = jax.random.randint(row_key, (POINTS_AT_ONCE,), 0, len(paths.known))
-    static = jnp.asarray(paths.still)
+    static = jnp.asarray(paths.static)
     if len(static):
         static = static[jax.random.randint(still_key, (STILL_AT_ONCE,), 0, len(static))]
     return frame, rows, static

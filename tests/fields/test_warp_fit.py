@@ -40,13 +40,13 @@ def turning_body(points=40):
     return path.astype(np.float32), time
 
 
-def some_paths(known=None, still=200):
+def some_paths(known=None, static=200):
     path, time = turning_body()
     if known is None:
         known = np.random.default_rng(1).uniform(size=path.shape[:2]) < 0.6
-    rest = np.random.default_rng(2).uniform(-1, 1, (still, 3)).astype(np.float32)
-    rest[:, 2] = 1
-    return PointPaths(time, np.zeros(FRAMES, int), path, known, rest)
+    wall = np.random.default_rng(2).uniform(-1, 1, (static, 3)).astype(np.float32)
+    wall[:, 2] = 1
+    return PointPaths(time, np.zeros(FRAMES, int), path, known, wall)
 
 
 def narrow(network):
@@ -95,7 +95,7 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
     assert fitted.last < 0.03
     places = canonical_places(field, fitted.params)
     for frame in (3, 12):
-        points = np.concatenate([paths.position[:, frame], paths.still])
+        points = np.concatenate([paths.position[:, frame], paths.static])
         back, wall = np.split(places(paths.time[frame], points), [len(paths.position)])
         # Also where a path was not known.
         off = np.linalg.norm(back - fitted.canonical, axis=-1)
@@ -105,7 +105,7 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
         body = paths.position[:, frame]
         true = np.linalg.norm(body - body.mean(0), axis=-1)
         assert 0.9 < np.median(size / true) < 1.1
-        assert np.median(np.linalg.norm(wall - paths.still, axis=-1)) < 0.03
+        assert np.median(np.linalg.norm(wall - paths.static, axis=-1)) < 0.03
 
 
 @pytest.mark.hard_cases
@@ -248,7 +248,7 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
         assert np.linalg.norm(ahead - true, axis=-1).mean() < 0.3 * size
         true = path[:, frame - 1] - path[:, frame]
         assert np.linalg.norm(back - true, axis=-1).mean() < 0.3 * size
-        wall = np.asarray(ask(paths.still, time[frame]))
+        wall = np.asarray(ask(paths.static, time[frame]))
         assert np.linalg.norm(wall, axis=-1).mean() < 0.1 * size
 
 
@@ -257,7 +257,7 @@ def test_points_seen_once_leave_everything_where_it_is():
     """Each has one place: there is no motion to find, and no wall that holds it."""
     known = np.zeros((40, FRAMES), bool)
     known[np.arange(40), np.arange(40) % FRAMES] = True
-    field, paths = field_of("nerfies-small"), some_paths(known, still=0)
+    field, paths = field_of("nerfies-small"), some_paths(known, static=0)
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     assert fitted.last < 5e-3

@@ -347,7 +347,7 @@ def test_a_scene_starts_from_the_evidence(tmp_path, monkeypatch):
     start = StartSpec(motion="tracks", moving_points=150, fit_steps=100)
     spec_ = small_scene(start=start)
     # There is room for two of them under the cap.
-    known = min(len(evidence.still.position), spec_.init.points)
+    known = min(len(evidence.static_cloud.position), spec_.init.points)
     cap = dataclasses.replace(spec_.strategy, cap_max=known + 150 + 2)
     spec_ = dataclasses.replace(spec_, strategy=cap)
     model = scene.build(spec_, scene.metadata_of(capture))

@@ -66,7 +66,7 @@ def test_what_is_beyond_the_budget_is_kept_and_stated(tmp_path, once, capsys):
     capture, log = moving_capture(preprocessing=LITTLE), []
     hasty = record.cached(capture, tmp_path, tell=log.append)
     assert "skipped, beyond the budget of work: dense static points" in log
-    assert not len(hasty.still.position)
+    assert not len(hasty.static_cloud.position)
     assert "half of the tracks" in hasty.left_out
     said = capsys.readouterr().err
     assert said.count("Preprocessing skipped half of the tracks") == 1

@@ -143,7 +143,7 @@ def test_a_scene_of_which_no_track_moves_is_static():
     score = np.zeros_like(evidence.score)
     static = evidence._replace(moving=moving, score=score)
     assert usable_paths.unusable(static)
-    assert usable_paths.stands_still(static, capture.times)
+    assert usable_paths.is_static(static, capture.times)
     score[: 1 + len(score) // 200] = 1
     for change in (
         {"score": score},
@@ -151,7 +151,7 @@ def test_a_scene_of_which_no_track_moves_is_static():
         {"score": score[:9] * 0},
         {"unusable": "too little texture"},
     ):
-        assert not usable_paths.stands_still(static._replace(**change), capture.times)
+        assert not usable_paths.is_static(static._replace(**change), capture.times)
 
 
 @pytest.mark.parametrize(("bases", "overrides"), [(20, ("motion.bases=20",)), (8, ())])

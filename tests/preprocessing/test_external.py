@@ -102,7 +102,7 @@ def test_paths_are_those_of_the_tracks_given_and_masks_are_the_masks(tmp_path):
     known = evidence.paths.known
     assert np.median(off[known]) < 0.1 * two_planes.NEAR  # drawn toward the wall
     # Our own tracks still say where the wall is.
-    assert len(evidence.still.position) > 2000
+    assert len(evidence.static_cloud.position) > 2000
 
 
 def test_a_mover_that_was_marked_is_no_noise_however_small():
@@ -112,10 +112,10 @@ def test_a_mover_that_was_marked_is_no_noise_however_small():
     assert small.moving.mean() < usable_paths.LEAST_MOVING
     assert "of the pixels show moving" in usable_paths.unusable(small)
     times = np.linspace(0, 1, len(small.row))
-    assert usable_paths.stands_still(small, times)
+    assert usable_paths.is_static(small, times)
     marked = small._replace(is_external=True)
     assert "of the pixels show moving" not in usable_paths.unusable(marked)
-    assert not usable_paths.stands_still(marked, times)
+    assert not usable_paths.is_static(marked, times)
 
 
 def test_tracks_of_larger_images_are_brought_to_those_that_are_read(tmp_path):

@@ -14,7 +14,7 @@ from nerfies_jax.preprocessing import (
     record,
     view_set,
 )
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks, pixel_of
 from tests.preprocessing import two_planes
 from tests.preprocessing.test_external import with_files
@@ -33,7 +33,7 @@ def test_depths_of_any_scale_are_brought_to_the_points_at_rest(inverse):
     row, column = pixel_of(pixel, true.shape[1:])
     depth = true[np.arange(3), row, column].astype(float)
     depth[:8] *= 3  # points that are wrong
-    rest = RestPoints(None, None, depth)
+    rest = StaticPoints(None, None, depth)
     aligned = external_depth.aligned(external, tracks, rest)
     # The penalty of the offset is what is left.
     np.testing.assert_allclose(aligned.depth[:, 2:], true[:, 2:], rtol=0.03)
@@ -58,7 +58,7 @@ def test_depth_that_tilts_over_the_image_is_straightened():
     tracks = Tracks(np.zeros(200, int), pixel, np.ones((200, 2), bool))
     row, column = pixel_of(pixel, shape[1:])
     depth = true[np.arange(2), row, column].astype(float)
-    aligned = external_depth.aligned(external, tracks, RestPoints(None, None, depth))
+    aligned = external_depth.aligned(external, tracks, StaticPoints(None, None, depth))
     assert np.median(abs(aligned.depth / true - 1)) < 0.01  # 0.05 without the tilt
     assert aligned.total_miss < 0.01
 
@@ -72,7 +72,7 @@ def card_and_wall():
     start = points.visible.argmax(1)
     card = Tracks(start, np.float32(points.pixel), points.visible)
     still = evidence.score < 0.3
-    static = evidence.tracks.take(still), evidence.rest.take(still)
+    static = evidence.tracks.take(still), evidence.static_fit.take(still)
     return views, card, paths.certain(views, card, points.position, 0.01), static
 
 

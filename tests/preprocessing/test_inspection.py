@@ -67,7 +67,7 @@ def test_cameras_that_take_turns_see_what_one_camera_sees():
 )
 def test_what_points_at_rest_are_off_by_weakens_both_answers(share, noise_px, answer):
     inspected = still()
-    tracks, rest = inspected.evidence.tracks, inspected.evidence.rest
+    tracks, rest = inspected.evidence.tracks, inspected.evidence.static_fit
     length = tracks.visible.sum(1)
     moves = np.cumsum(length) <= share * length.sum()
     residual = np.where(tracks.visible, noise_px, np.nan)

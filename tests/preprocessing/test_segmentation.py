@@ -4,8 +4,8 @@ import numpy as np
 
 from nerfies_jax.preprocessing import (
     record,
-    rest_points,
     segmentation,
+    static_points,
     tracks,
     view_set,
 )
@@ -36,7 +36,7 @@ def half_lost():
 
 def test_an_object_that_lost_half_of_its_tracks_is_completed():
     views, evidence, left, true, lower = half_lost()
-    rest = rest_points.fit(views, left)
+    rest = static_points.fit(views, left)
 
     def segmented(lengths):
         watch = Watch(lambda part: None, ENOUGH_WORK)
@@ -60,7 +60,7 @@ def test_beyond_the_budget_no_track_is_added():
     told = []
     watch = Watch(told.append, 1e-6)
     watch.spend(1.0)
-    rest = rest_points.fit(views, left)
+    rest = static_points.fit(views, left)
     found = segmentation.segmented(views, evidence.flow, left, rest, USUAL, watch)
     assert not len(found.mask_tracks.start)
     assert not len(found.mask_score)

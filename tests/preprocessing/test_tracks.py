@@ -11,18 +11,18 @@ import scipy.ndimage as nd
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.preprocessing import (
     dense_flow,
+    dense_points,
     motion,
     moving,
     paths,
     photo_consistency,
     record,
-    rest_points,
-    still_points,
+    static_points,
     tracks,
     view_set,
 )
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from tests.preprocessing import two_planes
 
@@ -173,13 +173,13 @@ def test_points_are_aligned_with_where_they_began():
 
 
 def test_points_at_rest_are_found_and_what_moves_misses(monkeypatch):
-    monkeypatch.setattr(rest_points, "AT_ONCE", 4)  # six tracks in two parts
+    monkeypatch.setattr(static_points, "AT_ONCE", 4)  # six tracks in two parts
     views = hand_held()
     rng = np.random.default_rng(0)
     point = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2], (6, 3))
     position = np.repeat(point[:, None], len(views.row), axis=1)
     position[3:] += np.linspace(0, 0.2, len(views.row))[:, None] * [0, 1, 0]
-    fitted = rest_points.fit(views, tracks_of(views, position))
+    fitted = static_points.fit(views, tracks_of(views, position))
     np.testing.assert_allclose(fitted.position[:3], point[:3], atol=1e-4)
     assert np.nanmax(fitted.residual[:3]) < 0.01
     assert (np.nanquantile(fitted.residual[3:], 0.7, axis=1) > 1).all()
@@ -190,9 +190,9 @@ def test_a_camera_in_place_gives_finite_points_at_rest():
     views = view_set.in_time_order(capture)
     position = np.repeat(np.array([[[0.1, 0.0, 1.5]]]), 6, axis=1)
     one = tracks_of(views, position)
-    fitted = rest_points.fit(views, one)
+    fitted = static_points.fit(views, one)
     assert np.isfinite(fitted.position).all()
-    assert still_points.depth_deviation(views, one, fitted) > 1
+    assert dense_points.depth_deviation(views, one, fitted) > 1
 
 
 def test_what_moves_is_marked_and_little_else():
@@ -268,14 +268,14 @@ def test_moving_neighbors_convince_and_a_lonely_track_is_overruled():
     inside, outside = np.flatnonzero(moves)[0], np.flatnonzero(~moves)[0]
     pixel[inside], pixel[outside] = (8, 30), (50, 30)
     residual[inside], residual[outside] = 0.1, 3.0
-    rest = RestPoints(np.zeros((300, 3)), np.repeat(residual[:, None], 6, 1), None)
+    rest = StaticPoints(np.zeros((300, 3)), np.repeat(residual[:, None], 6, 1), None)
     score = moving.track_scores(Tracks(np.zeros(300, int), pixel, seen), rest)
     assert score[inside] > 0.5 > score[outside]
 
 
 def test_still_points_lie_on_the_wall_and_have_its_colors():
     capture, evidence = gathered()
-    cloud = evidence.still
+    cloud = evidence.static_cloud
     assert len(cloud.position) > 2000
     depth = cloud.position[:, 2]
     assert abs(np.median(depth) - two_planes.FAR) < 0.01 * two_planes.FAR
@@ -322,7 +322,7 @@ def test_the_banded_solution_is_the_dense_one():
     around = np.full((1, 24), 1.5)
     fitted = paths.least_acceleration(views, one, 0.05, around)
     span = slice(2, 24)
-    ray = rest_points.track_rays(views, one)[0, span]
+    ray = static_points.track_rays(views, one)[0, span]
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     noise = paths.TRACK_PX / views.intrinsics[0, 0, 0]
     pull = (noise / paths.AROUND_DEVIATION) ** 2
@@ -403,7 +403,7 @@ def test_masks_alone_are_those_of_the_whole_preprocessing(tmp_path):
         )
     assert len(whole.path_tracks.visible)
     assert not len(masks.path_tracks.visible)
-    assert not len(masks.still.position)
+    assert not len(masks.static_cloud.position)
     # A record without paths is never read in place of a whole one.
     files = {
         record.file_of(capture, tmp_path, masks_only=only) for only in (False, True)

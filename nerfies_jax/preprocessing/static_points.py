@@ -17,14 +17,14 @@ LEAST_DEPTH = 1e-3  # scene units, only for weights
 AT_ONCE = 2048  # tracks, at 200 bytes for each track and frame
 
 
-class RestPoints(NamedTuple):
+class StaticPoints(NamedTuple):
     """One static point for each track."""
 
     position: np.ndarray  # [tracks, 3] scene units
     residual: np.ndarray  # [tracks, frames] px, NaN if the track is not visible
     depth: np.ndarray  # [tracks, frames] z-depth of the point
 
-    def take(self, which: np.ndarray) -> "RestPoints":
+    def take(self, which: np.ndarray) -> "StaticPoints":
         """Select points.
 
         Args:
@@ -33,7 +33,7 @@ class RestPoints(NamedTuple):
         Returns:
           The selected points.
         """
-        return RestPoints(*(part[which] for part in self))
+        return StaticPoints(*(part[which] for part in self))
 
 
 def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
@@ -53,7 +53,7 @@ def track_rays(views: Views, tracks: Tracks) -> np.ndarray:
     return np.einsum("fji,nfj->nfi", views.rotation, local)
 
 
-def fit(views: Views, tracks: Tracks) -> RestPoints:
+def fit(views: Views, tracks: Tracks) -> StaticPoints:
     """Fit static points by least squares of distances to rays over depth squared.
 
     This is nearly the reprojection error in pixels.
@@ -96,10 +96,10 @@ def _fit(views, tracks):
         miss = np.linalg.norm(pixel - tracks.pixel[:, frame], axis=-1)
         miss = np.where(depth[:, frame] > 0, miss, BEHIND_PX)
         residual[:, frame] = np.where(tracks.visible[:, frame], miss, np.nan)
-    return RestPoints(position, residual, depth)
+    return StaticPoints(position, residual, depth)
 
 
-def miss(rest: RestPoints) -> np.ndarray:
+def miss(rest: StaticPoints) -> np.ndarray:
     """Compute the 70 % quantile over frames of the reprojection error of each track.
 
     Args:

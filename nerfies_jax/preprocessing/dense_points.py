@@ -4,10 +4,10 @@ import numpy as np
 
 from nerfies_jax.capture.capture import PointCloud
 from nerfies_jax.geometry.rays import across_ray
-from nerfies_jax.preprocessing import rest_points
+from nerfies_jax.preprocessing import static_points
 from nerfies_jax.preprocessing import tracks as tracking
 from nerfies_jax.preprocessing.dense_flow import NeighborFlow
-from nerfies_jax.preprocessing.rest_points import RestPoints
+from nerfies_jax.preprocessing.static_points import StaticPoints
 from nerfies_jax.preprocessing.tracks import TRACK_PX, Tracks
 from nerfies_jax.preprocessing.view_set import Views
 
@@ -58,9 +58,9 @@ def dense(views: Views, flow: NeighborFlow, moving: np.ndarray) -> PointCloud:
         tracks = tracks.take(enough)
         if not len(tracks.visible):
             continue
-        rest = rest_points.fit(near, tracks)
-        valid = _has_depth(near, tracks, rest)
-        places.append(rest.position[valid])
+        static_fit = static_points.fit(near, tracks)
+        valid = _has_depth(near, tracks, static_fit)
+        places.append(static_fit.position[valid])
         pixel = starts[enough][valid, 1:].astype(int)
         colors.append(views.image[center][pixel[:, 1], pixel[:, 0]])
     if not places:
@@ -107,24 +107,26 @@ def without(tracks: Tracks, moving: np.ndarray) -> Tracks:
     return tracks._replace(visible=tracks.visible & ~moving[frames, row, column])
 
 
-def _has_depth(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+def _has_depth(views: Views, tracks: Tracks, static_fit: StaticPoints) -> np.ndarray:
     """Test if tracks fit their static point and determine its depth."""
-    fits = rest_points.miss(rest) < MISS_PX
-    return fits & (depth_deviation(views, tracks, rest) < DEPTH_DEVIATION)
+    fits = static_points.miss(static_fit) < MISS_PX
+    return fits & (depth_deviation(views, tracks, static_fit) < DEPTH_DEVIATION)
 
 
-def depth_deviation(views: Views, tracks: Tracks, rest: RestPoints) -> np.ndarray:
+def depth_deviation(
+    views: Views, tracks: Tracks, static_fit: StaticPoints
+) -> np.ndarray:
     """Compute the relative standard deviation of the distance of static points.
 
     Args:
       views: The frames.
       tracks: The tracks.
-      rest: Their static points.
+      static_fit: Their static points.
 
     Returns:
       Deviations relative to the distance [tracks], inf without parallax.
     """
-    offset = rest.position[:, None] - views.position
+    offset = static_fit.position[:, None] - views.position
     distance = np.maximum(np.linalg.norm(offset, axis=-1), 1e-9)
     unit = offset / distance[..., None]
     across = across_ray(unit)
