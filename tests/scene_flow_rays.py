@@ -48,10 +48,10 @@ def frames_and_batch(rng, dtype):
     shape = (TIMESTAMPS, height, width)
     flow = FrameFlow(
         forward=rng.normal(size=(*shape, 2)).astype(np.float32),
-        forward_seen=rng.uniform(size=shape) < 0.8,
+        forward_valid=rng.uniform(size=shape) < 0.8,
         next_row=np.minimum(np.arange(TIMESTAMPS) + 1, TIMESTAMPS - 1).astype(np.int32),
         backward=rng.normal(size=(*shape, 2)).astype(np.float32),
-        backward_seen=rng.uniform(size=shape) < 0.8,
+        backward_valid=rng.uniform(size=shape) < 0.8,
         previous_row=np.maximum(np.arange(TIMESTAMPS) - 1, 0).astype(np.int32),
     )
     depths = rng.uniform(2, 5, shape).astype(np.float32)
@@ -285,7 +285,7 @@ def _flow_pixel(lists, frames, batch, r, side, points, flows, weight):
     flow = frames.flow
     other = (flow.next_row, flow.previous_row)[side][row]
     shift = (flow.forward, flow.backward)[side][row, line, column]
-    seen = (flow.forward_seen, flow.backward_seen)[side][row, line, column]
+    seen = (flow.forward_valid, flow.backward_valid)[side][row, line, column]
     if other == row or not seen or not batch.valid[r]:
         return
     stretch = abs(frames.times[other] - frames.times[row]) * 3

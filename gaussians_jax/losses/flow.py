@@ -147,7 +147,7 @@ def flow_error(
     size = frames.images.shape[2], frames.images.shape[1]
     rendered = render_flow(start, end, pair, size, raster_spec)
     shift = frames.flow.forward[row].astype(rendered.flow.dtype)
-    valid = frames.flow.forward_seen[row] & (rendered.share >= spec.opaque)
+    valid = frames.flow.forward_valid[row] & (rendered.share >= spec.opaque)
     if observation.valid is not None:
         valid = valid & observation.valid
     if spec.moving_only and frames.moving is not None:

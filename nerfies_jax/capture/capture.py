@@ -460,7 +460,7 @@ def describe(capture: Capture) -> tuple[str, ...]:
     if capture.depths is not None:
         extras.append(f"depth on {(capture.depths > 0).mean():.1%} of pixels")
     if capture.flow is not None:
-        extras.append(f"flow on {capture.flow.forward_seen.mean():.1%} of pixels")
+        extras.append(f"flow on {capture.flow.forward_valid.mean():.1%} of pixels")
     if extras:
         lines.append("; ".join(extras))
     return (*lines, *capture.notes)

@@ -13,16 +13,16 @@ class FrameFlow(NamedTuple):
     """Optical flow from each frame to the next and the previous one of the same camera.
 
     Flow leads from the center of a pixel to the position of the same surface point in
-    the other frame, in pixels right and down. `seen` is True where both frames show the
+    the other frame, in pixels right and down. It is valid where both frames show the
     point. A frame without a neighbor refers to its own row and has no valid flow.
     Leaves are NumPy arrays in a capture and JAX arrays in training.
     """
 
     forward: Float[Array, "frames height width 2"]
-    forward_seen: Bool[Array, "frames height width"]
+    forward_valid: Bool[Array, "frames height width"]
     next_row: Int[Array, " frames"]
     backward: Float[Array, "frames height width 2"]
-    backward_seen: Bool[Array, "frames height width"]
+    backward_valid: Bool[Array, "frames height width"]
     previous_row: Int[Array, " frames"]
 
 

@@ -174,7 +174,7 @@ def heldout_flow(
     """
     if capture.flow is None:
         return None
-    visible = capture.flow.forward_seen[scored.rows]
+    visible = capture.flow.forward_valid[scored.rows]
     places = np.flatnonzero(visible.any(axis=(1, 2)))
     if not len(places):
         return None

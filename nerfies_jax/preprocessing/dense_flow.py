@@ -40,15 +40,15 @@ JUMP_SHARE, AS_ALIKE = 0.03, 1.1
 class NeighborFlow(NamedTuple):
     """Flow of each frame to the next and to the previous one in time.
 
-    It starts at pixel centers and is in pixels right and down. `forward_seen` and
-    `backward_seen` are True if both flows are consistent. The forward flow of the last
+    It starts at pixel centers and is in pixels right and down. `forward_valid` and
+    `backward_valid` are True if both flows are consistent. The forward flow of the last
     frame and the backward flow of the first are zero and not valid.
     """
 
     forward: np.ndarray  # [frames, height, width, 2] float32
-    forward_seen: np.ndarray  # [frames, height, width] bool
+    forward_valid: np.ndarray  # [frames, height, width] bool
     backward: np.ndarray
-    backward_seen: np.ndarray
+    backward_valid: np.ndarray
 
 
 def enlarged(views: Views) -> int:
@@ -259,23 +259,23 @@ def checked(forward: np.ndarray, backward: np.ndarray) -> NeighborFlow:
     Returns:
       The flow, with masks of consistent pixels.
     """
-    forward_seen, backward_seen = np.zeros((2, *forward.shape[:3]), bool)
+    forward_valid, backward_valid = np.zeros((2, *forward.shape[:3]), bool)
     for frame in range(len(forward) - 1):
         ahead, behind = forward[frame], backward[frame + 1]
-        forward_seen[frame] = closed(ahead, behind)
-        backward_seen[frame + 1] = closed(behind, ahead)
-    return NeighborFlow(forward, forward_seen, backward, backward_seen)
+        forward_valid[frame] = closed(ahead, behind)
+        backward_valid[frame + 1] = closed(behind, ahead)
+    return NeighborFlow(forward, forward_valid, backward, backward_valid)
 
 
 def _is_lost(flow, frame):
     """Test if a coherent area was tracked to a frame but not beyond it."""
-    return _covers_patch(flow.backward_seen[frame] & ~flow.forward_seen[frame])
+    return _covers_patch(flow.backward_valid[frame] & ~flow.forward_valid[frame])
 
 
 def _jumps(flow, frame):
     """Test if a coherent area changes its motion abruptly at a frame."""
     change = np.linalg.norm(flow.forward[frame] + flow.backward[frame], axis=-1)
-    valid = flow.backward_seen[frame] & flow.forward_seen[frame]
+    valid = flow.backward_valid[frame] & flow.forward_valid[frame]
     return _covers_patch(valid & (change > JUMP_SHARE * change.shape[1]))
 
 
@@ -301,8 +301,8 @@ def _continue_motion(flow, frame, images, search):
     behind = search_from(frame + 1, frame, -cv2.remap(ahead, *at, cv2.INTER_LINEAR))
     small = [_smaller(images[index], times) for index in (frame, frame + 1)]
     for start, shift, valid, new, other in (
-        (frame, flow.forward, flow.forward_seen, ahead, behind),
-        (frame + 1, flow.backward, flow.backward_seen, behind, ahead),
+        (frame, flow.forward, flow.forward_valid, ahead, behind),
+        (frame + 1, flow.backward, flow.backward_valid, behind, ahead),
     ):
         old, pair = shift[start], small if start == frame else small[::-1]
         disagrees = np.linalg.norm(new - old, axis=-1) > JUMP_SHARE * width

@@ -39,10 +39,10 @@ def with_flow(capture: Capture) -> Capture:
         images = dense_flow.leveled(views)
         neighbors = dense_flow.between_neighbors(views, images, span)
         flow.forward[views.row] = neighbors.forward
-        flow.forward_seen[views.row] = neighbors.forward_seen & views.valid
+        flow.forward_valid[views.row] = neighbors.forward_valid & views.valid
         flow.next_row[views.row[:-1]] = views.row[1:]
         flow.backward[views.row] = neighbors.backward
-        flow.backward_seen[views.row] = neighbors.backward_seen & views.valid
+        flow.backward_valid[views.row] = neighbors.backward_valid & views.valid
         flow.previous_row[views.row[1:]] = views.row[:-1]
     note = "optical flow between neighboring frames was computed from the images"
     if (flow.next_row == rows).all():

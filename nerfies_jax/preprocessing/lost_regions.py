@@ -93,8 +93,8 @@ def recovered(
         for guesses in _affine_flows(views, pair):
             _extend(pair, flow, guesses, search)
         forward, backward = flow.forward[frame], flow.backward[frame + 1]
-        flow.forward_seen[frame] = dense_flow.closed(forward, backward)
-        flow.backward_seen[frame + 1] = dense_flow.closed(backward, forward)
+        flow.forward_valid[frame] = dense_flow.closed(forward, backward)
+        flow.backward_valid[frame + 1] = dense_flow.closed(backward, forward)
     return flow
 
 
@@ -107,8 +107,8 @@ def _find_regions(views, flow, frame):
     )
     regions = []
     for index, consistent in (
-        (frame, flow.forward_seen[frame]),
-        (frame + 1, flow.backward_seen[frame + 1]),
+        (frame, flow.forward_valid[frame]),
+        (frame + 1, flow.backward_valid[frame + 1]),
     ):
         lost_mask = np.uint8(views.textured[index] & ~consistent)
         wide = cv2.morphologyEx(lost_mask, cv2.MORPH_OPEN, narrow)
@@ -238,8 +238,8 @@ def _extend(pair, flow, guesses, search):
 def _sides(flow, frame):
     """Return flow and its consistency, forward of a frame and backward of the next."""
     return (
-        (flow.forward[frame], flow.forward_seen[frame]),
-        (flow.backward[frame + 1], flow.backward_seen[frame + 1]),
+        (flow.forward[frame], flow.forward_valid[frame]),
+        (flow.backward[frame + 1], flow.backward_valid[frame + 1]),
     )
 
 

@@ -277,7 +277,7 @@ def carried(views: Views, flow: NeighborFlow) -> float:
       The share.
     """
     texture = views.textured[:-1]
-    return float((flow.forward_seen[:-1] & texture).sum() / max(texture.sum(), 1))
+    return float((flow.forward_valid[:-1] & texture).sum() / max(texture.sum(), 1))
 
 
 def _select_moving(tracks, score, moves, shortest, size):

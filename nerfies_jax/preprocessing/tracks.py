@@ -158,7 +158,7 @@ def chain(flow: NeighborFlow, starts: np.ndarray) -> Tracks:
     pixel = np.zeros((count, frames, 2), np.float32)
     visible = np.zeros((count, frames), bool)
     pixel[each, start], visible[each, start] = starts[:, 1:], True
-    sides = ((1, flow.forward, flow.forward_seen), (-1, *flow[2:]))
+    sides = ((1, flow.forward, flow.forward_valid), (-1, *flow[2:]))
     for sign, shift, usable in sides:
         for here in range(frames)[::sign]:
             there = here + sign

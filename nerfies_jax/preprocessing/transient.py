@@ -111,14 +111,16 @@ def _always_there(evidence):
 def _jumps(views: Views, flow: NeighborFlow) -> tuple[np.ndarray, np.ndarray]:
     """Compute the share of pixels that only one of two neighboring frames shows."""
     part = view_set.times_smaller(views)
-    has_flow = views.textured[:-1] & flow.forward_seen[:-1]
+    has_flow = views.textured[:-1] & flow.forward_valid[:-1]
     flow_shares = has_flow.sum((1, 2)) / np.maximum(views.textured[:-1].sum((1, 2)), 1)
     views = view_set.smaller(views, part)
     images = [_normalize_contrast(gray) for gray in views.gray]
     shares = []
     for index in range(len(views.row) - 1):
-        there = _search_of(flow.forward[index], flow.forward_seen[index], part)
-        back = _search_of(flow.backward[index + 1], flow.backward_seen[index + 1], part)
+        there = _search_of(flow.forward[index], flow.forward_valid[index], part)
+        back = _search_of(
+            flow.backward[index + 1], flow.backward_valid[index + 1], part
+        )
         shares.append(
             min(
                 _measure_loss(views, images, (index, index + 1), there, back.flow),

@@ -35,8 +35,8 @@ def test_selected_frames_keep_their_neighbors_and_lose_those_that_went():
     assert part.previous_row.tolist() == [0, 1, 1]  # f3 lost f2, f0 none, f1 to f0
     np.testing.assert_array_equal(part.forward[1], whole.flow.forward[0])
     np.testing.assert_array_equal(part.backward[2], whole.flow.backward[1])
-    np.testing.assert_array_equal(part.forward_seen[1], whole.flow.forward_seen[0])
-    for gone in (part.forward[2], part.forward_seen[2], part.backward[0]):
+    np.testing.assert_array_equal(part.forward_valid[1], whole.flow.forward_valid[0])
+    for gone in (part.forward[2], part.forward_valid[2], part.backward[0]):
         assert not gone.any()
     assert whole.flow.forward[1].any()  # the whole capture is as it was
 
@@ -46,8 +46,8 @@ def test_training_flow_counts_the_frames_that_are_learned_from():
     flow = flows.training_flow(whole)
     assert flow.next_row.tolist() == [1, 1]
     assert flow.previous_row.tolist() == [0, 0]
-    assert flow.forward_seen[0].any()
-    assert not flow.forward_seen[1].any()
+    assert flow.forward_valid[0].any()
+    assert not flow.forward_valid[1].any()
     assert flows.training_flow(make()) is None
 
 
@@ -68,8 +68,8 @@ def test_shrunk_flow_is_the_mean_of_each_block_in_larger_pixels(size, factor):
                     block.astype(np.float64).mean(0) / factor,
                     rtol=1e-6,
                 )
-                seen = whole.flow.forward_seen[frame, lines, columns]
-                assert small.forward_seen[frame, row, column] == seen.all()
+                seen = whole.flow.forward_valid[frame, lines, columns]
+                assert small.forward_valid[frame, row, column] == seen.all()
     np.testing.assert_array_equal(small.next_row, whole.flow.next_row)
 
 
@@ -96,7 +96,7 @@ def test_stored_flow_that_does_not_fit_is_refused_with_its_file(tmp_path):
     with pytest.raises(CaptureError, match=r"forward/.*\.npy: flow of shape"):
         nerfies_format.read(tmp_path / "copy")
     file.unlink()  # a frame may lack its flow
-    assert not nerfies_format.read(tmp_path / "copy").flow.forward_seen[0].any()
+    assert not nerfies_format.read(tmp_path / "copy").flow.forward_valid[0].any()
     (folder / "neighbors.json").write_text(json.dumps({"forward": [1, 2]}))
     with pytest.raises(CaptureError, match=r"neighbors\.json"):
         nerfies_format.read(tmp_path / "copy")

@@ -99,7 +99,7 @@ CAPTURES = [
         flow(backward=some_flow(size=(5, 4)).backward),
         "backward flow is float32 of shape (4, 4, 5, 2); expected",
     ),
-    (flow(forward_seen=FLOW.forward_seen.astype(np.uint8)), "forward flow is uint8"),
+    (flow(forward_valid=FLOW.forward_valid.astype(np.uint8)), "forward flow is uint8"),
     (flow(next_row=np.arange(3)), "expected one row number"),
     (flow(next_row=np.arange(4.0)), "expected one row number"),
     (flow_at("next_row", 1, 4), "frame 'f1' leads to row 4 of 4"),
@@ -107,7 +107,7 @@ CAPTURES = [
     (flow_at("forward", (2, 1, 1, 0), np.nan), "forward flow of frame 'f2'"),
     (flow_at("backward", (3, 0, 0, 1), np.inf), "backward flow of frame"),
     (
-        flow_at("backward_seen", (0, 2, 2), True),
+        flow_at("backward_valid", (0, 2, 2), True),
         "backward flow of frame 'f0' is seen, but it leads to no other",
     ),
     (TWICE | {"flow": FLOW}, "'f1' leads to 'f2' of another camera"),

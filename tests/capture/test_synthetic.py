@@ -116,9 +116,9 @@ def test_moving_pixels_are_those_whose_points_move(scene, rng):
 def test_flow_leads_to_where_numpy_sees_the_moved_point(scene, rng, step):
     capture, truth = scene
     flow, seen = (
-        (truth.flow_forward, truth.forward_seen)
+        (truth.flow_forward, truth.forward_valid)
         if step == 1
-        else (truth.flow_backward, truth.backward_seen)
+        else (truth.flow_backward, truth.backward_valid)
     )
     last = [6, 9] if step == 1 else [0, 7]
     assert not seen[last].any()
@@ -290,7 +290,7 @@ def test_a_transient_changes_its_own_pixels_alone(small):
     # Where it will be gone in the next frame, its pixels are seen no more.
     leaves = shown[:-1] & ~shown[1:]
     gone = np.flatnonzero(leaves)[0]
-    assert not passed_truth.forward_seen[gone][passed_truth.transient[gone]].any()
+    assert not passed_truth.forward_valid[gone][passed_truth.transient[gone]].any()
 
 
 @pytest.mark.full

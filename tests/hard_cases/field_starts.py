@@ -180,7 +180,7 @@ def times(factor: float) -> Callable[[PyTree], PyTree]:
 
 BY_CODE = ("appearance",)  # codes of motion come with them in all these papers
 FLOW = ("scene_flow",)
-SEEN = ("forward_seen", "backward_seen")
+SEEN = ("forward_valid", "backward_valid")
 NEEDS = {
     "no depth known": FLOW,
     "constant depth": FLOW,

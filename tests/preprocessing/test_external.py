@@ -224,9 +224,9 @@ def test_flow_given_is_taken_and_checked_both_ways(tmp_path):
             (tmp_path / side / f"{number}.flo").write_bytes(head + one.tobytes())
     evidence = record.gather(with_files(capture, flow=tmp_path))
     np.testing.assert_array_equal(evidence.flow.forward, own.flow.forward)
-    assert not evidence.flow.forward_seen[3].any()
+    assert not evidence.flow.forward_valid[3].any()
     np.testing.assert_array_equal(
-        evidence.flow.forward_seen[4], own.flow.forward_seen[4]
+        evidence.flow.forward_valid[4], own.flow.forward_valid[4]
     )
 
 

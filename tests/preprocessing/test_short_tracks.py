@@ -134,7 +134,7 @@ def test_a_region_that_jumps_is_found_again():
             step = np.diff(views.position[frame : frame + 2, :2], axis=0)[0]
             true = two_planes.FOCAL * (on_card * card - step) / depth
             pixels = capture.moving[frame] == on_card
-            pixels &= flow.forward_seen[frame]
+            pixels &= flow.forward_valid[frame]
             error = np.linalg.norm(flow.forward[frame] - true, axis=-1)
             shares.append((error[pixels] < 1).sum() / capture.moving[frame].sum())
         return np.array(shares)

@@ -79,9 +79,9 @@ def test_flow_of_a_wall_is_that_of_its_homography_in_any_light(light):
     inner = np.s_[8:-8, 12:-12]
     error = np.linalg.norm(flow.forward[1] - true, axis=-1)[inner]
     assert np.median(error) < 0.12
-    assert flow.forward_seen[1][inner].mean() > 0.9
-    assert not flow.forward_seen[-1].any()
-    assert not flow.backward_seen[0].any()
+    assert flow.forward_valid[1][inner].mean() > 0.9
+    assert not flow.forward_valid[-1].any()
+    assert not flow.backward_valid[0].any()
 
 
 def test_flow_that_does_not_lead_back_is_not_trusted():

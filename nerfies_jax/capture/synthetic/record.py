@@ -19,7 +19,7 @@ from nerfies_jax.capture.synthetic.truth import SceneTruth
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.runtime import data_parallel, events
 
-VERSION = 3  # increase it when images of a spec change, to invalidate caches
+VERSION = 4  # increase it when images or files of a spec change, to invalidate caches
 TRUTH_FILE = "truth.npz"  # next to the Nerfies files; other readers ignore it
 
 
@@ -210,8 +210,8 @@ def _flow(plan, scene_truth):
     rows = np.arange(len(plan.time))
     leaves = []
     for step, shift, valid in (
-        (1, scene_truth.flow_forward, scene_truth.forward_seen),
-        (-1, scene_truth.flow_backward, scene_truth.backward_seen),
+        (1, scene_truth.flow_forward, scene_truth.forward_valid),
+        (-1, scene_truth.flow_backward, scene_truth.backward_valid),
     ):
         neighbor = np.clip(rows + step, 0, len(rows) - 1)
         same_camera = plan.camera_id[neighbor] == plan.camera_id[rows]

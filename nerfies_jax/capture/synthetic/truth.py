@@ -25,7 +25,7 @@ class SceneTruth(NamedTuple):
 
     Flow leads from the center of a pixel to the position of its point in the next
     (previous) frame of the same camera, in pixels. It is also defined where that point
-    is occluded or outside of the image. `forward_seen` and `backward_seen` are True
+    is occluded or outside of the image. `forward_valid` and `backward_valid` are True
     where the point is visible in both frames. The last (first) frame of a camera has
     zero flow that is nowhere visible.
     """
@@ -35,9 +35,9 @@ class SceneTruth(NamedTuple):
     thing_names: tuple[str, ...]  # by id
     transient: np.ndarray  # [frames, height, width] bool
     flow_forward: np.ndarray  # [frames, height, width, 2] float32, right and down
-    forward_seen: np.ndarray  # [frames, height, width] bool
+    forward_valid: np.ndarray  # [frames, height, width] bool
     flow_backward: np.ndarray
-    backward_seen: np.ndarray
+    backward_valid: np.ndarray
     light_gain: np.ndarray  # [frames, 3] float32: exposure as a gain of linear light
     track_thing: np.ndarray  # [tracks] int32
     track_canonical: np.ndarray  # [tracks, 3] float32: the point at time 0, world

@@ -530,8 +530,8 @@ def _flow_term(
     assert frames.flow is not None
     flow = frames.flow
     pairs = (
-        (flow.forward, flow.forward_seen, flow.next_row),
-        (flow.backward, flow.backward_seen, flow.previous_row),
+        (flow.forward, flow.forward_valid, flow.next_row),
+        (flow.backward, flow.backward_valid, flow.previous_row),
     )
     total = jnp.zeros((), level.point.dtype)
     for sign, one, (shift, visible, rows) in zip(SIGNS, sides, pairs, strict=True):
