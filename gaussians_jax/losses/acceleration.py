@@ -180,10 +180,10 @@ class Bound:
         at_time = context.at_time
 
         def evaluate(params):
-            selected = splats.take_rows(params, rows)
-            canonical = selected.rows["splats"].mean
+            sample = splats.take_rows(params, rows)
+            canonical = sample.rows["splats"].mean
             times = instants(condition.time, interval)
-            before, now, after = (at_time(selected, t).mean for t in times)
+            before, now, after = (at_time(sample, t).mean for t in times)
             value = acceleration_loss(canonical, before, now, after, decay, spec.drift)
             static = jnp.mean(_stillness(canonical, now, decay))
             any_active = jnp.any(active)

@@ -170,9 +170,9 @@ def _divide(offset, deviation, center):
 def _median(depth, valid):
     """Return the lower median of positive depths, 0 without any."""
     count = jnp.sum(valid)
-    fixed = jax.lax.stop_gradient(jnp.where(valid, depth, 1))
-    middle = nth_smallest(fixed, valid, jnp.maximum(count - 1, 0) // 2)
-    index = jnp.argmax(valid & (fixed == middle))
+    constant_depth = jax.lax.stop_gradient(jnp.where(valid, depth, 1))
+    middle = nth_smallest(constant_depth, valid, jnp.maximum(count - 1, 0) // 2)
+    index = jnp.argmax(valid & (constant_depth == middle))
     return jnp.where(count > 0, jnp.where(valid, depth, 0)[index], 0)
 
 
@@ -231,16 +231,23 @@ def terms(spec: DepthSpec, observation: Observation) -> dict[str, Term]:
     assert rendering is not None
     assert rendering.depth is not None  # rendered because of `required_data`
     # Depths are often stored in half precision, too little to count and center.
-    truth, rendered = widened(truth), widened(rendering.depth)
-    valid = (truth > 0) & jnp.isfinite(truth) & (rendered > 0) & jnp.isfinite(rendered)
+    truth, rendered_depth = widened(truth), widened(rendering.depth)
+    valid = (
+        (truth > 0)
+        & jnp.isfinite(truth)
+        & (rendered_depth > 0)
+        & jnp.isfinite(rendered_depth)
+    )
     valid = valid & (rendering.alpha >= spec.opaque)
     if observation.valid is not None:
         valid = valid & observation.valid
     # Selected before any computation, because unknown pixels may be NaN.
-    rendered, truth = (jnp.where(valid, x, 1).reshape(-1) for x in (rendered, truth))
+    rendered_depth, truth = (
+        jnp.where(valid, x, 1).reshape(-1) for x in (rendered_depth, truth)
+    )
     if spec.space == "disparity":
-        rendered, truth = 1 / rendered, 1 / truth
+        rendered_depth, truth = 1 / rendered_depth, 1 / truth
     valid = valid.reshape(-1)
-    error = FORMS[spec.kind](rendered, truth, valid)
+    error = FORMS[spec.kind](rendered_depth, truth, valid)
     share = jnp.mean(valid.astype(error.dtype))
     return {"error": Term(error, spec.weight), "known": Term(share, None)}

@@ -145,15 +145,17 @@ def flow_error(
     first, second = (cameras.take(frames.cameras, at) for at in (row, other))
     pair = first, second
     size = frames.images.shape[2], frames.images.shape[1]
-    rendered = render_flow(start, end, pair, size, raster_spec)
-    shift = frames.flow.forward[row].astype(rendered.flow.dtype)
-    valid = frames.flow.forward_valid[row] & (rendered.share >= spec.opaque)
+    flow_render = render_flow(start, end, pair, size, raster_spec)
+    shift = frames.flow.forward[row].astype(flow_render.flow.dtype)
+    valid = frames.flow.forward_valid[row] & (flow_render.share >= spec.opaque)
     if observation.valid is not None:
         valid = valid & observation.valid
     if spec.moving_only and frames.moving is not None:
         valid = valid & frames.moving[frames.image_row(row)]
-    object_flow = shift - camera_flow(pair, rendered.depth, raster_spec.distorted)
-    return error(rendered.flow, object_flow, valid), jnp.mean(valid.astype(shift.dtype))
+    object_flow = shift - camera_flow(pair, flow_render.depth, raster_spec.distorted)
+    return error(flow_render.flow, object_flow, valid), jnp.mean(
+        valid.astype(shift.dtype)
+    )
 
 
 def render_flow(

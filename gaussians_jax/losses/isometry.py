@@ -81,11 +81,11 @@ class Bound:
         rows = draw_active(context.key, active, count)
         graph = context.state
         indices = jnp.concatenate([rows[:, None], graph.neighbor[rows]], axis=1)
-        selected = splats.take_rows(params, indices.ravel())
+        sample = splats.take_rows(params, indices.ravel())
         shape = (*indices.shape, 3)
-        canonical = selected.rows["splats"].mean.reshape(shape) / self.extent
+        canonical = sample.rows["splats"].mean.reshape(shape) / self.extent
         assert context.at_time is not None
-        mean = context.at_time(selected, context.condition.time).mean
+        mean = context.at_time(sample, context.condition.time).mean
         return change_of_distances(
             canonical, mean.reshape(shape) / self.extent, graph.weight[rows]
         )

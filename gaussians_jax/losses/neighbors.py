@@ -198,12 +198,12 @@ class Bound:
             return inconsistency(embedding, graph, active)
 
         value = _from_step(spec.start, context.step, evaluate, params.rows[self.of])
-        linked = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
+        linked_share = jnp.mean((graph.weight > LINKED).astype(value.dtype), axis=1)
         active_count = jnp.maximum(jnp.sum(active), 1).astype(value.dtype)
         # Inactive Gaussians have no weight and are not counted.
         return {
             "inconsistency": Term(value, spec.weight),
-            "linked": Term(jnp.sum(linked) / active_count, None),
+            "linked": Term(jnp.sum(linked_share) / active_count, None),
         }
 
 

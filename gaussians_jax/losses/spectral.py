@@ -327,10 +327,10 @@ def weights(
     Returns:
       The weights.
     """
-    enabled = jnp.where(step < spec.after, 0.0, 1.0)
+    gate = jnp.where(step < spec.after, 0.0, 1.0)
 
     def weight(most, logit):
-        return enabled * most * _opening(spec, logit, step, steps)
+        return gate * most * _opening(spec, logit, step, steps)
 
     return Gates(
         *(

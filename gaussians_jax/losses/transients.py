@@ -75,21 +75,23 @@ def static_pixels(
       left out.
     """
     color, truth = jax.lax.stop_gradient((color, truth))
-    observed = jnp.ones(color.shape[:2], bool) if valid is None else valid
+    is_observed = jnp.ones(color.shape[:2], bool) if valid is None else valid
     # Unobserved pixels may be NaN.
     residual = jnp.mean(jnp.abs(color - truth), axis=-1)
-    residual = jnp.where(observed, residual, 0)
+    residual = jnp.where(is_observed, residual, 0)
     if valid is None:
         # Not summed by XLA, which takes seconds to fold a constant.
-        count = jnp.asarray(_window_count(observed.shape, spec.window), residual.dtype)
+        count = jnp.asarray(
+            _window_count(is_observed.shape, spec.window), residual.dtype
+        )
     else:
-        count = _window_sum(observed.astype(residual.dtype), spec.window)
+        count = _window_sum(is_observed.astype(residual.dtype), spec.window)
     local = _window_sum(residual, spec.window) / jnp.maximum(count, 1)
-    mean = losses.masked_mean(residual[..., None], observed)
+    mean = losses.masked_mean(residual[..., None], is_observed)
     transient = local > jnp.maximum(spec.ratio * mean, spec.least)
-    transient = transient & observed & (step >= spec.start)
-    share = losses.masked_mean(transient.astype(residual.dtype)[..., None], observed)
-    return observed & ~transient, share
+    transient = transient & is_observed & (step >= spec.start)
+    share = losses.masked_mean(transient.astype(residual.dtype)[..., None], is_observed)
+    return is_observed & ~transient, share
 
 
 def _window_count(shape, side):

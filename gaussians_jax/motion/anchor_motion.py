@@ -124,12 +124,12 @@ def offsets(
 def _pose_children(
     net: Anchors,
     spec: AnchorMotionSpec,
-    derived: tuple[Splats, tuple[Carried, Features]],
+    child_state: tuple[Splats, tuple[Carried, Features]],
     rows: Gaussians,
     code: Float[Array, " code"] | None,
 ) -> Gaussians:
     """Compute the child Gaussians of moved anchors, with their own motion at a time."""
-    canonical, (children, features) = derived
+    canonical, (children, features) = child_state
     if code is None:
         return carried.pose_children(children, None, canonical, rows)
     inputs = features.residual[..., spec.residual // 2 :]
@@ -220,20 +220,24 @@ def _derive_rows(spec, scene, condition):
     return carried.canonical_children(rows, params), (params, features)
 
 
-def _derive(spec, scene, derived, rows, condition):
+def _derive(spec, scene, child_state, rows, condition):
     """Return the children, with fine motion after the warm-up."""
     net = scene.nets[NAME]
     if not spec.moves:
-        return _pose_children(net, spec, derived, rows, None)
+        return _pose_children(net, spec, child_state, rows, None)
     code = codes.at_time(net.times, condition.time)
     if not spec.warm_up or condition.step is None:
-        return _pose_children(net, spec, derived, rows, code)
+        return _pose_children(net, spec, child_state, rows, code)
     return jax.lax.cond(
         condition.step < spec.warm_up,
-        lambda net, derived, rows: _pose_children(net, spec, derived, rows, None),
-        lambda net, derived, rows: _pose_children(net, spec, derived, rows, code),
+        lambda net, child_state, rows: _pose_children(
+            net, spec, child_state, rows, None
+        ),
+        lambda net, child_state, rows: _pose_children(
+            net, spec, child_state, rows, code
+        ),
         net,
-        derived,
+        child_state,
         rows,
     )
 
@@ -296,8 +300,8 @@ class Bound(BoundMotion):
         moving = falling(spec, "learning_rate") if spec.moves else None
         law = None if spec.rate is None else falling(spec.rate, "learning_rate")
         make = falling(spec, "make_rate")
-        shared = Anchors(moving, make, moving, moving, law)
-        return MotionParams(falling(spec, "feature_rate"), shared)
+        shared_rates = Anchors(moving, make, moving, moving, law)
+        return MotionParams(falling(spec, "feature_rate"), shared_rates)
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize features and networks."""

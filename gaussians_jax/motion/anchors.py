@@ -308,9 +308,9 @@ def quantize(features: Features, law: Law, spec: AnchorMotionSpec) -> Features:
     return Features(reference, _straight_through(features.residual, quantized))
 
 
-def _straight_through(values, rounded):
+def _straight_through(values, rounded_values):
     """Return rounded values with the gradient of the unrounded ones."""
-    return values + jax.lax.stop_gradient(rounded - values)
+    return values + jax.lax.stop_gradient(rounded_values - values)
 
 
 def _steps(law):

@@ -222,11 +222,11 @@ def prepare_point(
     Returns:
       The part of the first layer that does not depend on time, and the basis vectors.
     """
-    encoded = encoding.encode(spec.position, point, None)
-    base = encoded @ params.base.hidden[0].weight[: len(encoded)]
+    features = encoding.encode(spec.position, point, None)
+    base = features @ params.base.hidden[0].weight[: len(features)]
     if params.basis is None:
         return Prepared(base, None)
-    return Prepared(base, basis_vectors(params.basis, spec, encoded))
+    return Prepared(base, basis_vectors(params.basis, spec, features))
 
 
 def basis_vectors(
@@ -300,20 +300,20 @@ def residual(
       Outputs by name: the weights of the basis vectors, and changes of rotation and
       scale.
     """
-    encoded = encoding.encode(spec.position, slow_mean, None)
-    position_only = dataclasses.replace(_weights_spec(spec), inputs=len(encoded))
-    return mlp.apply(position_only, weights, encoded)
+    features = encoding.encode(spec.position, slow_mean, None)
+    position_only = dataclasses.replace(_weights_spec(spec), inputs=len(features))
+    return mlp.apply(position_only, weights, features)
 
 
 def _offsets_at_time(
-    at_time: AtTime, spec: BasisMotionSpec, point: Float[Array, "3"], prepared: Prepared
+    at_time: AtTime, spec: BasisMotionSpec, point: Float[Array, "3"], cache: Prepared
 ) -> Offsets:
     """Evaluate equations 3, 5 and 6 for one Gaussian."""
-    slow = _base_displacement(at_time.base, spec, prepared.base)
+    slow = _base_displacement(at_time.base, spec, cache.base)
     heads = residual(at_time.weights, spec, point + slow)
     fast = heads["weights"]
-    if prepared.basis is not None:
-        fast = exact_product(prepared.basis, fast)
+    if cache.basis is not None:
+        fast = exact_product(cache.basis, fast)
     return Offsets(slow + fast, heads["turn"], heads["log_scale"])
 
 

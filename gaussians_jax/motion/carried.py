@@ -224,8 +224,8 @@ def turns(
     Returns:
       Rotation vectors (rad) in the axes of the core.
     """
-    encoded = encoding.encode(spec.time, time[None], None)
-    at_time = mlp.with_known(network_spec(spec), network, encoded)
+    features = encoding.encode(spec.time, time[None], None)
+    at_time = mlp.with_known(network_spec(spec), network, features)
     unit = jax.vmap(jax.vmap(quaternion.normalize))(children.quaternion)
     rotation_only = dataclasses.replace(network_spec(spec), inputs=4)
     return mlp.apply(rotation_only, at_time, unit)["turn"]

@@ -105,10 +105,10 @@ def init_embedding(
     if spec.waves is None:
         noise = jax.random.normal(key, (mean.shape[0], spec.embedding), jnp.float32)
         return spec.spread * noise.astype(mean.dtype)
-    centered = mean - jnp.mean(mean, axis=0)
-    radius_sq = jnp.mean(jnp.sum(centered**2, axis=1))
+    centered_mean = mean - jnp.mean(mean, axis=0)
+    radius_sq = jnp.mean(jnp.sum(centered_mean**2, axis=1))
     # A single position has the phase of the center.
-    unit = centered / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
+    unit = centered_mean / jnp.sqrt(jnp.where(radius_sq > 0, radius_sq, 1))
     return _random_waves(key, spec, unit, spec.embedding)
 
 

@@ -162,8 +162,8 @@ def rendered(
     if derivation is None:
         return params.rows["splats"], deformed
     derive_rows, derive = derivation
-    derived = derive_rows(params, condition)
-    return derived[0], derive(params, derived, deformed, condition)
+    child_state = derive_rows(params, condition)
+    return child_state[0], derive(params, child_state, deformed, condition)
 
 
 def significance(
@@ -196,8 +196,8 @@ def children_per_gaussian(effects: Effects, params: Params) -> int:
     """
     if child_component(effects) is None:
         return 1
-    rendered = jax.eval_shape(lambda params: rendered_rows(effects, params), params)
-    return rendered.mean.shape[0] // params.rows["splats"].mean.shape[0]
+    children = jax.eval_shape(lambda params: rendered_rows(effects, params), params)
+    return children.mean.shape[0] // params.rows["splats"].mean.shape[0]
 
 
 def probe(effects: Effects, params: Params) -> Float[Array, "gaussians 2"]:

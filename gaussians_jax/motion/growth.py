@@ -131,9 +131,14 @@ def common_motion(
     """
     stride = max(1, -(-displacement.shape[0] // MEDIAN_ROWS))
     counts, displacement = counts[::stride], displacement[::stride]
-    ordered = jnp.sort(jnp.where(counts[:, None], displacement, jnp.inf), axis=0)
+    sorted_displacement = jnp.sort(
+        jnp.where(counts[:, None], displacement, jnp.inf), axis=0
+    )
     number = jnp.sum(counts, dtype=jnp.int32)
-    middle = (ordered[jnp.maximum(number - 1, 0) // 2] + ordered[number // 2]) / 2
+    middle = (
+        sorted_displacement[jnp.maximum(number - 1, 0) // 2]
+        + sorted_displacement[number // 2]
+    ) / 2
     return jnp.where(number > 0, middle, jnp.zeros_like(middle))
 
 
@@ -154,12 +159,12 @@ def motion(state: Travel) -> Float[np.ndarray, " gaussians"]:
       Distances in scene units, zero if never observed.
     """
     low, high = (np.asarray(x, np.float64) for x in state)
-    observed = (low <= high).all(axis=1, keepdims=True)
-    side = np.subtract(high, low, where=observed, out=np.zeros_like(low))
+    is_observed = (low <= high).all(axis=1, keepdims=True)
+    side = np.subtract(high, low, where=is_observed, out=np.zeros_like(low))
     # Scaled by the largest side, because its square may overflow or underflow.
     longest = side.max(axis=1, initial=0.0, keepdims=True)
-    scaled = np.divide(side, longest, where=longest > 0, out=np.zeros_like(side))
-    return longest[:, 0] / 2 * np.linalg.norm(scaled, axis=1)
+    relative_side = np.divide(side, longest, where=longest > 0, out=np.zeros_like(side))
+    return longest[:, 0] / 2 * np.linalg.norm(relative_side, axis=1)
 
 
 def growth_factor(
@@ -256,5 +261,5 @@ class MotionGuided:
         if event.changes_rows:
             factor = grow_score(self.spec, self.extent, travel, population.step)
             stats = stats._replace(grad2d=stats.grad2d * jnp.asarray(factor))
-        changed = event.apply(population._replace(state=stats))
-        return changed._replace(state=Guided(changed.state, travel))
+        new_population = event.apply(population._replace(state=stats))
+        return new_population._replace(state=Guided(new_population.state, travel))

@@ -173,13 +173,13 @@ def field_spec(spec: KanMotionSpec) -> KANSpec | MLPSpec:
 
 
 def _kan_spec(spec):
-    enabled = {
+    head_flags = {
         "position": spec.position,
         "log_scale": spec.scale,
         "turn": spec.rotation,
     }
     heads = tuple(
-        (name, HeadSpec(3, "zero")) for name, is_on in enabled.items() if is_on
+        (name, HeadSpec(3, "zero")) for name, is_on in head_flags.items() if is_on
     )
     return KANSpec(
         in_features=spec.embedding + spec.time_code,

@@ -226,11 +226,11 @@ def offsets_at_time(
     Returns:
       The residuals.
     """
-    encoded = jax.vmap(lambda point: encoding.encode(spec.position, point, None))(
+    features = jax.vmap(lambda point: encoding.encode(spec.position, point, None))(
         points
     )
     position_only = dataclasses.replace(trunk_spec(spec), inputs=spec.position.width(3))
-    return Offsets(**mlp.apply(position_only, at_time, encoded))
+    return Offsets(**mlp.apply(position_only, at_time, features))
 
 
 def apply(gaussians: Gaussians, offsets: Offsets, scale_rule: str) -> Gaussians:

@@ -285,7 +285,7 @@ def _find(
     spec: NodeMotionSpec,
     extent: Number,
     mean: Float[Array, "gaussians 3"],
-    linked: bool = True,
+    with_links: bool = True,
 ) -> Neighborhoods:
     """Find the nodes near each Gaussian, and the links between nodes."""
     near = skinning.nearest(mean, nodes.position, spec.near)
@@ -293,7 +293,7 @@ def _find(
     if spec.mask is not None:
         assert nodes.mask is not None
         moving = jnp.any((openness(nodes.mask) > 0)[near], axis=1)
-    if spec.rigidity is None or not linked:
+    if spec.rigidity is None or not with_links:
         return Neighborhoods(near, None, moving)
     times = jnp.linspace(0, 1, TIMES, dtype=mean.dtype)
     shifts = jax.vmap(lambda time: moves(nodes, spec, extent, time).shift)(times)
@@ -338,7 +338,7 @@ def _arap_loss(
     nodes: Nodes,
     spec: NodeMotionSpec,
     extent: Number,
-    linked: Links,
+    links: Links,
     times: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
     """Compute the deviation of linked nodes from rigid motion, in squared extents."""
@@ -346,7 +346,7 @@ def _arap_loss(
         (nodes.position + moves(nodes, spec, extent, time).shift) / extent
         for time in times
     )
-    return skinning.arap_error(before, after, linked)
+    return skinning.arap_error(before, after, links)
 
 
 def fit_to_paths(
@@ -434,7 +434,7 @@ class Bound(BoundMotion):
     def precompute(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find the nodes near each Gaussian."""
         mean = gaussians.mean
-        return _find(params.shared, self.spec, self.extent, mean, linked=False)
+        return _find(params.shared, self.spec, self.extent, mean, with_links=False)
 
     def refresh(self, params: MotionParams, gaussians: Splats) -> Neighborhoods:
         """Find nodes near Gaussians and each other, for a new set of Gaussians."""
@@ -461,8 +461,8 @@ class Bound(BoundMotion):
             value = _arap_loss(nodes, spec, self.extent, context.state.links, times)
             terms["unrigidity"] = Term(value, spec.rigidity)
         if spec.mask is not None and spec.mask.sparsity > 0:
-            used = jnp.mean(jax.nn.sigmoid(nodes.mask))
-            terms["moving"] = Term(used, spec.mask.sparsity)
+            open_share = jnp.mean(jax.nn.sigmoid(nodes.mask))
+            terms["moving"] = Term(open_share, spec.mask.sparsity)
         return from_step(spec.warm_up, context.step, terms)
 
     def fit(self, paths: Paths, key: Key[Array, ""]) -> Guess:

@@ -192,8 +192,8 @@ def offsets(
         time_features = planes.time_features(spec.planes, lines, point)
         return planes.features(spec.planes, space, time_features)
 
-    encoded = jax.vmap(features)(position, cached)
-    return Offsets(**mlp.apply(network_spec(spec), params.network, encoded))
+    plane_features = jax.vmap(features)(position, cached)
+    return Offsets(**mlp.apply(network_spec(spec), params.network, plane_features))
 
 
 def smoothness(spec: PlaneMotionSpec, levels: tuple[Level, ...]) -> dict[str, Term]:

@@ -212,8 +212,8 @@ def deform(
     rows = len(motion.turn)
     flat = jnp.concatenate([motion.linear.reshape(rows, 9), motion.offset], axis=-1)
     table = jnp.concatenate([flat, motion.turn], axis=-1)
-    mixed, mean = components(exact_product(weights, table)), components(gaussians.mean)
-    linear, offset, turn = mixed[:9], mixed[9:12], stacked(mixed[12:])
+    blend, mean = components(exact_product(weights, table)), components(gaussians.mean)
+    linear, offset, turn = blend[:9], blend[9:12], stacked(blend[12:])
     new_mean = [
         coordinate + (dot(linear[3 * i : 3 * i + 3], mean) + offset[i])
         for i, coordinate in enumerate(mean)
@@ -288,10 +288,10 @@ def _supported_intervals(times, valid, label, spec):
     inside = np.abs(times - middle[:, None]) <= (edges[1] - edges[0]) / 2 + 1e-6
     nearest = np.argmin(np.abs(times - middle[:, None]), axis=1)
     inside[np.arange(len(middle)), nearest] = True
-    supported = np.ones((spec.bases, spec.knots - 1), bool)
+    is_supported = np.ones((spec.bases, spec.knots - 1), bool)
     for group in np.unique(label):
-        supported[group] = (inside & valid[label == group].any(0)).any(1)
-    return supported
+        is_supported[group] = (inside & valid[label == group].any(0)).any(1)
+    return is_supported
 
 
 def _at_knots(track, times, spec):

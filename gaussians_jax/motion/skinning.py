@@ -89,8 +89,8 @@ def weights(
     Returns:
       Weights that sum to one.
     """
-    clamped = jnp.clip(log_radius, *splats.LOG_SCALE_RANGE)
-    return jax.nn.softmax(-distance_sq * jnp.exp(-2 * clamped) / 2, axis=-1)
+    clamped_log_radius = jnp.clip(log_radius, *splats.LOG_SCALE_RANGE)
+    return jax.nn.softmax(-distance_sq * jnp.exp(-2 * clamped_log_radius) / 2, axis=-1)
 
 
 def displace(
@@ -177,11 +177,11 @@ def blend(
         leader = jnp.where(exceeds[:, None], turn, leader)
         largest = jnp.where(exceeds, weight[:, k], largest)
 
-    def aligned(turn):
+    def align(turn):
         opposite = jnp.sum(leader * turn, axis=1, keepdims=True) < 0
         return jnp.where(opposite, -turn, turn)
 
-    return sum(weight[:, k : k + 1] * aligned(turn) for k, turn in enumerate(turns))
+    return sum(weight[:, k : k + 1] * align(turn) for k, turn in enumerate(turns))
 
 
 def _rotation_offset(turn, vector):
@@ -237,13 +237,13 @@ def arap_error(
     Returns:
       The error in squared units of the positions.
     """
-    edges, rotated = (
+    edges, edges_after = (
         positions[:, None] - positions[linked.neighbor] for positions in (before, after)
     )
-    spread = exact_einsum("nk,nki,nkj->nij", linked.weight, edges, rotated)
+    spread = exact_einsum("nk,nki,nkj->nij", linked.weight, edges, edges_after)
     left, _, right = jax.vmap(matrix3.svd)(jax.lax.stop_gradient(spread))
     rotation = exact_einsum("nij,nkj->nik", left, right)
-    residual = edges - exact_einsum("nij,nkj->nki", rotation, rotated)
+    residual = edges - exact_einsum("nij,nkj->nki", rotation, edges_after)
     total = jnp.sum(linked.weight * jnp.sum(residual * residual, axis=2))
     return total / len(before)
 

@@ -72,8 +72,8 @@ def visible_share(
     Returns:
       Factors of the opacity.
     """
-    clamped = jnp.clip(log_width, *LOG_WIDTH_RANGE)
-    return jnp.exp(-jnp.square(since * jnp.exp(-clamped)))
+    clamped_log_width = jnp.clip(log_width, *LOG_WIDTH_RANGE)
+    return jnp.exp(-jnp.square(since * jnp.exp(-clamped_log_width)))
 
 
 def faded(rows: Fading, gaussians: Gaussians, time: Float[Array, ""]) -> Gaussians:

@@ -144,8 +144,8 @@ def _at_time(
     params: MLP, spec: TimeBasisSpec, extent: Number, time: Float[Array, ""]
 ) -> Trajectories:
     """Evaluate the trajectories at a time."""
-    encoded = encoding.encode(spec.time, time[None], None)
-    outputs = mlp.apply(network_spec(spec), params, encoded)
+    features = encoding.encode(spec.time, time[None], None)
+    outputs = mlp.apply(network_spec(spec), params, features)
     shift, turn = (outputs[name].reshape(spec.count, 3) for name in ("shift", "turn"))
     return Trajectories(extent * shift, turn)
 
@@ -191,9 +191,11 @@ def sparsity(
     """
     # Not `abs`, whose gradient at zero is one and would move static Gaussians.
     size = coefficients * jnp.sign(coefficients)
-    used = jnp.sum(size, axis=-1) / (jnp.max(size, axis=-1) + REST)
+    basis_count = jnp.sum(size, axis=-1) / (jnp.max(size, axis=-1) + REST)
     number = jnp.sum(active, dtype=jnp.int32)
-    share = jnp.where(active, used, 0) / jnp.maximum(number, 1).astype(used.dtype)
+    share = jnp.where(active, basis_count, 0) / jnp.maximum(number, 1).astype(
+        basis_count.dtype
+    )
     return jnp.sum(share)
 
 

@@ -101,7 +101,7 @@ class DefaultStrategySpec:
             rows = population.params.rows["splats"]
             floating = floaters.find(self.floaters, rows, frames.cameras, size)
             stats = stats._replace(active=np.asarray(stats.active) & ~floating)
-        changed = densify(
+        update = densify(
             population.optimizer,
             population.params,
             population.moments,
@@ -111,7 +111,7 @@ class DefaultStrategySpec:
             step=population.step,
             extent=population.extent,
         )
-        return population._replace(params=changed.params, moments=changed.moments)
+        return population._replace(params=update.params, moments=update.moments)
 
     def _reset(self, population: Population) -> Population:
         params, moments = reset_opacity(
@@ -261,10 +261,10 @@ def densify(
     """
     rows, kind, report = _plan(params.rows["splats"], stats, spec, step, extent)
     count, capacity = len(rows), stats.active.shape[0]
-    needed = splats.capacity_for(count, spec.cap_max)
+    new_capacity = splats.capacity_for(count, spec.cap_max)
     # Shrinks by two buckets only, so that small changes of the count do not recompile.
-    if needed > capacity or count * 9 < capacity * 4:
-        capacity = needed
+    if new_capacity > capacity or count * 9 < capacity * 4:
+        capacity = new_capacity
     padding = capacity - count
     params, moments, fresh = _rebuild(
         optimizer,
@@ -308,21 +308,21 @@ def _plan(rows, stats, spec, step, extent):
 
     clones = np.flatnonzero(selection & ~splits)
     parents = np.flatnonzero(splits)
-    unchanged = np.flatnonzero(keeps & ~splits)
-    source = np.concatenate([unchanged, clones, np.repeat(parents, 2)])
+    kept_rows = np.flatnonzero(keeps & ~splits)
+    source = np.concatenate([kept_rows, clones, np.repeat(parents, 2)])
     kind = np.concatenate(
         [
-            np.where(np.isin(unchanged, clones), CLONED, KEPT),
+            np.where(np.isin(kept_rows, clones), CLONED, KEPT),
             np.full(len(clones), CLONE),
             np.full(2 * len(parents), CHILD),
         ]
     )
-    broken = int((stats.active & ~finite).sum())
+    broken_count = int((stats.active & ~finite).sum())
     report = Report(
         cloned=len(clones),
         split=len(parents),
-        pruned=int((stats.active & ~keeps).sum()) - broken,
-        broken=broken,
+        pruned=int((stats.active & ~keeps).sum()) - broken_count,
+        broken=broken_count,
         refused=len(candidates) - len(best),
     )
     return source, kind, report
@@ -343,8 +343,8 @@ def row_summary(rows):
         return jnp.all(jnp.isfinite(leaf.reshape(leaf.shape[0], -1)), axis=1)
 
     finite = functools.reduce(jnp.logical_and, map(is_finite, rows))
-    activated = splats.activate(rows)
-    return finite, activated.opacity, jnp.max(activated.scale, axis=1)
+    gaussians = splats.activate(rows)
+    return finite, gaussians.opacity, jnp.max(gaussians.scale, axis=1)
 
 
 @functools.partial(jax.jit, static_argnames=("optimizer", "shrink", "revised"))
@@ -369,9 +369,9 @@ def _split_rows(
     shrink: float,
 ) -> Splats:
     """Sample children from the Gaussians that they duplicate, and shrink them."""
-    activated = splats.activate(rows)
+    gaussians = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
-    offset = jax.vmap(quaternion.rotate)(rows.quaternion, activated.scale * noise)
+    offset = jax.vmap(quaternion.rotate)(rows.quaternion, gaussians.scale * noise)
     child = child[:, None]
     return rows._replace(
         mean=jnp.where(child, rows.mean + offset, rows.mean),
@@ -424,10 +424,10 @@ def reset_opacity(
     """
     rows = params.rows["splats"]
     bound = math.log(spec.reset_opacity / (1 - spec.reset_opacity))
-    lowered = rows._replace(opacity_logit=jnp.minimum(rows.opacity_logit, bound))
-    params = params._replace(rows=params.rows | {"splats": lowered})
-    mirrored = jax.tree.map(lambda _: False, params)
-    opacity_only = mirrored.rows["splats"]._replace(opacity_logit=True)
-    mirrored = mirrored._replace(rows=mirrored.rows | {"splats": opacity_only})
-    moments = row_optimizer.map_moments(optimizer, jnp.zeros_like, moments, mirrored)
+    new_rows = rows._replace(opacity_logit=jnp.minimum(rows.opacity_logit, bound))
+    params = params._replace(rows=params.rows | {"splats": new_rows})
+    mask = jax.tree.map(lambda _: False, params)
+    opacity_only = mask.rows["splats"]._replace(opacity_logit=True)
+    mask = mask._replace(rows=mask.rows | {"splats": opacity_only})
+    moments = row_optimizer.map_moments(optimizer, jnp.zeros_like, moments, mask)
     return params, moments

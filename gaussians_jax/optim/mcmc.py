@@ -217,12 +217,12 @@ def refine(
       Parameters, optimizer state and a report.
     """
     move_key, add_key = jax.random.split(key)
-    params, moments, relocated = relocate(optimizer, params, moments, move_key, spec)
-    params, moments, added = add(optimizer, params, moments, add_key, spec)
-    report = added._replace(
-        relocated=relocated.relocated,
-        refused=relocated.refused + added.refused,
-        broken=relocated.broken,
+    params, moments, relocation = relocate(optimizer, params, moments, move_key, spec)
+    params, moments, addition = add(optimizer, params, moments, add_key, spec)
+    report = addition._replace(
+        relocated=relocation.relocated,
+        refused=relocation.refused + addition.refused,
+        broken=relocation.broken,
     )
     return params, moments, report
 
@@ -252,14 +252,14 @@ def add(
     rows = params.rows["splats"]
     active, finite, opacity = _opacities(rows)
     count = int(active.sum())
-    requested = int(spec.growth * count) - count
-    extra = max(min(requested, spec.cap_max - count), 0)
+    requested_count = int(spec.growth * count) - count
+    extra = max(min(requested_count, spec.cap_max - count), 0)
     visible = active & finite & (opacity > 0)
     report = densification.Report(
-        active=count, capacity=len(active), refused=requested - extra
+        active=count, capacity=len(active), refused=requested_count - extra
     )
     if extra == 0 or not visible.any():
-        return params, moments, report._replace(refused=requested)
+        return params, moments, report._replace(refused=requested_count)
     capacity = max(splats.capacity_for(count + extra, spec.cap_max), len(active))
     source = np.zeros(capacity, int)
     source[: len(active)] = np.arange(len(active))
@@ -306,15 +306,15 @@ def _share(optimizer, params, moments, source, copies, inactive, least):
         optimizer, params, moments, source, copies > 1, inactive
     )
     rows = params.rows["splats"]
-    activated = splats.activate(rows)
+    gaussians = splats.activate(rows)
     opacity, scale = compute_relocation(
-        activated.opacity, activated.scale, copies, least
+        gaussians.opacity, gaussians.scale, copies, least
     )
-    shared = copies > 1
+    is_shared = copies > 1
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     rows = rows._replace(
-        opacity_logit=jnp.where(shared, logit, rows.opacity_logit),
-        log_scale=jnp.where(shared[:, None], jnp.log(scale), rows.log_scale),
+        opacity_logit=jnp.where(is_shared, logit, rows.opacity_logit),
+        log_scale=jnp.where(is_shared[:, None], jnp.log(scale), rows.log_scale),
     )
     return params._replace(rows=params.rows | {"splats": rows}), moments
 
@@ -342,14 +342,14 @@ def position_noise(
     References:
       Kheradmand et al. 2024 (3DGS-MCMC, arXiv:2404.09591), Equation 8.
     """
-    activated = splats.activate(rows)
+    gaussians = splats.activate(rows)
     noise = jax.random.normal(key, rows.mean.shape, rows.mean.dtype)
     axes = jax.vmap(quaternion.to_matrix)(
         rows.quaternion
     )  # columns are the principal axes
-    principal = exact_einsum("nji,nj->ni", axes, noise) * activated.scale**2
+    principal = exact_einsum("nji,nj->ni", axes, noise) * gaussians.scale**2
     displacement = exact_einsum("nij,nj->ni", axes, principal)
-    faint = jax.nn.sigmoid(-100 * (activated.opacity - spec.min_opacity))
+    faint = jax.nn.sigmoid(-100 * (gaussians.opacity - spec.min_opacity))
     rate = jnp.asarray(spec.noise_lr * learning_rate, faint.dtype)
     strength = jnp.where(splats.active_mask(rows), faint * rate, 0)
     return strength[:, None] * displacement
@@ -380,11 +380,11 @@ def mean_opacity_and_scale(
       The mean opacity, and the mean of all three scales in scene units. Both are zero
       without active Gaussians.
     """
-    activated = splats.activate(rows)
+    gaussians = splats.activate(rows)
     active = splats.active_mask(rows)
-    count = jnp.maximum(jnp.sum(active), 1).astype(activated.opacity.dtype)
-    opacity = jnp.sum(jnp.where(active, activated.opacity, 0)) / count
-    scale = jnp.sum(jnp.where(active[:, None], activated.scale, 0)) / (3 * count)
+    count = jnp.maximum(jnp.sum(active), 1).astype(gaussians.opacity.dtype)
+    opacity = jnp.sum(jnp.where(active, gaussians.opacity, 0)) / count
+    scale = jnp.sum(jnp.where(active[:, None], gaussians.scale, 0)) / (3 * count)
     return opacity, scale
 
 

@@ -87,8 +87,8 @@ def scale_by_row_radam(
 
     def direction(age, first, second):
         length = moment_length(age, b2)
-        adapted = rectification(length, b2) * first / (jnp.sqrt(second) + eps)
-        return jnp.where(length < threshold, first, adapted)
+        adaptive_step = rectification(length, b2) * first / (jnp.sqrt(second) + eps)
+        return jnp.where(length < threshold, first, adaptive_step)
 
     return _scale_by_row_moments(b1, b2, direction)
 
@@ -287,12 +287,12 @@ def gather_rows(
     Returns:
       Parameters and optimizer state of the new capacity.
     """
-    gathered = splats.take_rows(params, rows)
-    deactivated = splats.deactivate(gathered.rows["splats"], inactive)
-    gathered = gathered._replace(rows=gathered.rows | {"splats": deactivated})
+    new_params = splats.take_rows(params, rows)
+    new_rows = splats.deactivate(new_params.rows["splats"], inactive)
+    new_params = new_params._replace(rows=new_params.rows | {"splats": new_rows})
 
     def gather(moment):
         is_reset = (fresh | inactive).reshape(fresh.shape + (1,) * (moment.ndim - 1))
         return jnp.where(is_reset, jnp.zeros_like(moment[:1]), moment[rows])
 
-    return gathered, map_moments(optimizer, gather, moments, _row_leaves(params))
+    return new_params, map_moments(optimizer, gather, moments, _row_leaves(params))

@@ -204,8 +204,8 @@ def annealed(rate: Schedule, spec: AnnealingSpec, steps: int) -> Schedule:
     def schedule(step):
         step = jnp.asarray(step, jnp.int32)
         # Subtracted as integers, so exp(0) is exactly 1 up to `after`.
-        elapsed = jnp.clip(step - spec.after, 0, length)
-        progress = elapsed.astype(jnp.result_type(float)) / length
+        elapsed_steps = jnp.clip(step - spec.after, 0, length)
+        progress = elapsed_steps.astype(jnp.result_type(float)) / length
         main = rate(jnp.minimum(step, spec.after))
         return jnp.where(step >= frozen, 0.0, main * jnp.exp(-spec.decay * progress))
 
