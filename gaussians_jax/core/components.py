@@ -123,8 +123,8 @@ def motion_of_capture(motion: Any, steps: int, metadata: SceneMetadata) -> Splat
     """
 
     def build_with(numbers):
-        renewed = dataclasses.replace(metadata, **numbers)
-        return compile_motion(bound(motion, steps, renewed))
+        new_metadata = dataclasses.replace(metadata, **numbers)
+        return compile_motion(bound(motion, steps, new_metadata))
 
     record = compile_motion(bound(motion, steps, metadata))
     return programs.taking(record, metadata.numbers, build_with)

@@ -84,9 +84,11 @@ def _unit(vector):
     is_zero = largest < jnp.finfo(vector.dtype).tiny
     # Scaled first, because squares underflow in float32 below 1e-19.
     divisor = jnp.where(is_zero, 1, jax.lax.stop_gradient(largest))
-    scaled = jnp.where(is_zero, jnp.eye(3, dtype=vector.dtype)[0], vector / divisor)
-    length = jnp.sqrt(jnp.sum(scaled * scaled))
-    return scaled / length, jnp.where(is_zero, 0, length * divisor)
+    scaled_vector = jnp.where(
+        is_zero, jnp.eye(3, dtype=vector.dtype)[0], vector / divisor
+    )
+    length = jnp.sqrt(jnp.sum(scaled_vector * scaled_vector))
+    return scaled_vector / length, jnp.where(is_zero, 0, length * divisor)
 
 
 def _reject(vector: Vector, unit: Vector) -> Vector:

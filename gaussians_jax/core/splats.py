@@ -221,9 +221,11 @@ def active_harmonics(
     count = splats.sh_rest.shape[1]
     # Coefficient k belongs to the degree floor(sqrt(k)); k = 0 is `sh_dc`.
     band = np.array([math.isqrt(k) for k in range(1, count + 1)], np.int32)
-    used = jnp.asarray(band) <= degree
-    masked = jnp.where(used[:, None], splats.sh_rest, jnp.zeros_like(splats.sh_rest))
-    return jnp.concatenate([splats.sh_dc, masked], axis=1)
+    is_active = jnp.asarray(band) <= degree
+    sh_rest = jnp.where(
+        is_active[:, None], splats.sh_rest, jnp.zeros_like(splats.sh_rest)
+    )
+    return jnp.concatenate([splats.sh_dc, sh_rest], axis=1)
 
 
 def capacity_for(count: int, most: int | None = None) -> int:
@@ -313,10 +315,10 @@ def pad_rows(params: Params, capacity: int) -> Params:
             "least one Gaussian and a capacity that is not smaller than their number"
         )
     rows = np.concatenate([np.arange(count), np.zeros(capacity - count, int)])
-    padded = jax.tree.map(lambda leaf: leaf[rows], params.rows)
+    padded_rows = jax.tree.map(lambda leaf: leaf[rows], params.rows)
     inactive = np.arange(capacity) >= count
-    padded["splats"] = _deactivate(padded["splats"], inactive)
-    return params._replace(rows=padded)
+    padded_rows["splats"] = _deactivate(padded_rows["splats"], inactive)
+    return params._replace(rows=padded_rows)
 
 
 def from_points(
@@ -457,14 +459,14 @@ def random_in_views(
     offset = pixel - per_view(cameras.principal_point_px, 2)
     y = offset[:, 1] / (focal * per_view(cameras.pixel_aspect))
     x = (offset[:, 0] - per_view(cameras.skew_px) * y) / focal
-    distorted = np.any(cameras.radial) or np.any(cameras.tangential)
-    if distorted or cameras.fisheye is not None:
+    has_distortion = np.any(cameras.radial) or np.any(cameras.tangential)
+    if has_distortion or cameras.fisheye is not None:
         axes = np.ndim(cameras.focal_px)
         cameras_of_view = jax.tree.map(
             lambda leaf: jnp.float32(per_view(leaf, *np.shape(leaf)[axes:])), cameras
         )
-        observed = jnp.float32(np.stack([x, y], axis=-1))
-        slopes, _ = jax.vmap(lens.undistort)(cameras_of_view, observed)
+        distorted_slopes = jnp.float32(np.stack([x, y], axis=-1))
+        slopes, _ = jax.vmap(lens.undistort)(cameras_of_view, distorted_slopes)
         x, y = np.asarray(slopes, np.float64).T
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1) * z[:, None]
     rotation = per_view(cameras.camera_from_world, 3, 3)

@@ -139,11 +139,11 @@ def split(
     if not len(times):
         raise ValueError("times is empty; 16 times over [0, 1] are enough")
     dtype = params.rows["splats"].mean.dtype
-    deformed = jax.jit(deform)
-    static = deformed(params, jnp.asarray(times[len(times) // 2], dtype))
+    compiled_deform = jax.jit(deform)
+    static = compiled_deform(params, jnp.asarray(times[len(times) // 2], dtype))
     moves = np.zeros(len(static.mean), bool)
     for time in times:
-        now = deformed(params, jnp.asarray(time, dtype))
+        now = compiled_deform(params, jnp.asarray(time, dtype))
         moves |= dynamic_mask(static, now, static_threshold)
         if fading:
             moves |= ~(np.abs(np.asarray(now.opacity - static.opacity)) <= FADES)

@@ -129,8 +129,8 @@ def at(
         # Opacities are not interpolated. The table's are set after the merge.
         opacity=jnp.zeros_like(mean[:, 0]),
     )
-    merged = static_rows.merge(knots.static, gaussians_at, knots.row_index)
-    return merged._replace(opacity=knots.static.opacity)
+    gaussians = static_rows.merge(knots.static, gaussians_at, knots.row_index)
+    return gaussians._replace(opacity=knots.static.opacity)
 
 
 def check(knots: int, interpolation: str) -> None:
@@ -161,12 +161,12 @@ def _window(
     """Return the index of the first knot to read, and the weight of each knot."""
     count = times.shape[0]
     check(count, interpolation)
-    clamped = jnp.clip(time, times[0], times[-1])
+    clamped_time = jnp.clip(time, times[0], times[-1])
     # Searched for, because floor(time * (count - 1)) may round to the wrong interval.
     # At a knot the weights are exactly 0 and 1.
-    left = jnp.searchsorted(times, clamped, side="right") - 1
+    left = jnp.searchsorted(times, clamped_time, side="right") - 1
     left = jnp.clip(left, 0, count - 2).astype(jnp.int32)
-    u = (clamped - times[left]) / (times[left + 1] - times[left])
+    u = (clamped_time - times[left]) / (times[left + 1] - times[left])
     if interpolation == "linear":
         return left, [1 - u, u]
     w0, w1, w2, w3 = catmull_rom(u)

@@ -132,12 +132,12 @@ def depth_order(
         )
         return number + 1, order[key & jnp.uint32((1 << position_bits) - 1)]
 
-    def unsorted(carry):
+    def is_unsorted(carry):
         shift = carry[0] * digit_bits
         return (shift < 32) & ((span >> jnp.minimum(shift, 31)) > 0)
 
     start = (jnp.uint32(0), jnp.arange(gaussians, dtype=jnp.int32))
-    return lax.while_loop(unsorted, one_pass, start)[1]
+    return lax.while_loop(is_unsorted, one_pass, start)[1]
 
 
 def _ordered_bits(depth):

@@ -54,12 +54,12 @@ def blend(
     order, batches = _by_length(isects, step.batch)
 
     def one_batch(carry):
-        number, state, used = carry
+        number, state, used_count = carry
         tiles = lax.dynamic_slice(order, (number * step.batch,), (step.batch,))
         start, end, center = _tile_rows(tiles, isects, grid, state.dtype)
         longest = jnp.max(end - start)
 
-        def unfinished(inner):
+        def has_pairs(inner):
             position, *_, alive = inner
             return (position < longest) & alive
 
@@ -84,20 +84,20 @@ def blend(
 
         transmittance, channels = _parts(state.at[tiles].get(mode="clip"))
         position, transmittance, channels, _ = lax.while_loop(
-            unfinished,
+            has_pairs,
             one_chunk,
             (jnp.int32(0), transmittance, channels, _any_open(transmittance)),
         )
         local = jnp.stack([transmittance, *channels], axis=1)
         state = state.at[tiles].set(local, mode="drop")
-        used = used.at[tiles].set(count(position), mode="drop")
-        return number + 1, state, used
+        used_count = used_count.at[tiles].set(count(position), mode="drop")
+        return number + 1, state, used_count
 
-    used = jnp.zeros(grid.tiles, jnp.int32)
-    _, state, used = lax.while_loop(
-        lambda carry: carry[0] < batches, one_batch, (jnp.int32(0), state, used)
+    used_count = jnp.zeros(grid.tiles, jnp.int32)
+    _, state, used_count = lax.while_loop(
+        lambda carry: carry[0] < batches, one_batch, (jnp.int32(0), state, used_count)
     )
-    return state, used
+    return state, used_count
 
 
 def blend_gradient(
@@ -142,7 +142,7 @@ def blend_gradient(
         longest = jnp.max(end - start)
         pixel_gradient = cotangent.at[tiles].get(mode="clip")
 
-        def unfinished(inner):
+        def has_pairs(inner):
             position, _, _, alive, _ = inner
             return (position < longest) & alive
 
@@ -165,7 +165,7 @@ def blend_gradient(
 
         transmittance, (remaining,) = _parts(state.at[tiles].get(mode="clip"))
         _, transmittance, remaining, _, gradient = lax.while_loop(
-            unfinished,
+            has_pairs,
             one_chunk,
             (
                 jnp.int32(0),
@@ -300,12 +300,12 @@ def _trace_back(transmittance, remaining, raw, alpha, rows, pixel_gradient, spec
         before = transmittance
         transmittance, is_rendered = _pass_through(before, alpha[i], spec)
         weight = jnp.where(is_rendered, before * alpha[i], 0)
-        projected = sum(
+        weight_gradient = sum(
             rows[SHAPE_COLUMNS + c][i][:, None] * pixel_gradient[:, c]
             for c in range(pixel_gradient.shape[1])
         )
-        remaining = remaining - weight * projected
-        grad = before * projected - remaining / (1 - alpha[i])
+        remaining = remaining - weight * weight_gradient
+        grad = before * weight_gradient - remaining / (1 - alpha[i])
         # d alpha / d exponent is alpha itself, which is zero below the cutoff.
         if spec.clamp_gradient == "zero":
             has_gradient, along_exponent = (

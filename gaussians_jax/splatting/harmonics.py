@@ -56,8 +56,8 @@ def unit_direction(offset: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     limits = jnp.finfo(offset.dtype)
     is_valid = (largest >= limits.tiny) & (largest <= limits.max)  # False for NaN
     axis = jnp.asarray([0, 0, 1], offset.dtype)
-    scaled, _ = near_one(jnp.where(is_valid, offset, axis), axis=-1)
-    return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
+    scaled_offset, _ = near_one(jnp.where(is_valid, offset, axis), axis=-1)
+    return scaled_offset / jnp.linalg.norm(scaled_offset, axis=-1, keepdims=True)
 
 
 def basis(

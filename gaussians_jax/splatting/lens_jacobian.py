@@ -132,22 +132,22 @@ def project(
 
 def _linearize(camera: Camera, x: Float[Array, ""], y: Float[Array, ""]) -> LinearLens:
     """Distort one point of the image plane, with the Jacobian of the distortion."""
-    squared = x * x + y * y
+    radius_sq = x * x + y * y
     if camera.fisheye is not None:
-        ratio, change, along = fisheye.stretch(camera.fisheye, squared)
+        ratio, change, along = fisheye.stretch(camera.fisheye, radius_sq)
         xx, xy, yy = (2 * change * product for product in (x * x, x * y, y * y))
         return LinearLens(
             (x * ratio, y * ratio), ratio + xx, xy, ratio + yy, (x * along, y * along)
         )
     k1, k2, k3 = (camera.radial[i] for i in range(3))
     p1, p2 = camera.tangential[0], camera.tangential[1]
-    ratio = 1 + squared * (k1 + squared * (k2 + squared * k3))
-    change = 2 * (k1 + squared * (2 * k2 + squared * 3 * k3))
-    linearized = (
-        x * ratio + 2 * p1 * x * y + p2 * (squared + 2 * x * x),
-        y * ratio + 2 * p2 * x * y + p1 * (squared + 2 * y * y),
+    ratio = 1 + radius_sq * (k1 + radius_sq * (k2 + radius_sq * k3))
+    change = 2 * (k1 + radius_sq * (2 * k2 + radius_sq * 3 * k3))
+    distorted_point = (
+        x * ratio + 2 * p1 * x * y + p2 * (radius_sq + 2 * x * x),
+        y * ratio + 2 * p2 * x * y + p1 * (radius_sq + 2 * y * y),
     )
     xx = ratio + change * x * x + 2 * p1 * y + 6 * p2 * x
     xy = change * x * y + 2 * p1 * x + 2 * p2 * y
     yy = ratio + change * y * y + 2 * p2 * x + 6 * p1 * y
-    return LinearLens(linearized, xx, xy, yy, (xx * x + xy * y, xy * x + yy * y))
+    return LinearLens(distorted_point, xx, xy, yy, (xx * x + xy * y, xy * x + yy * y))

@@ -233,12 +233,14 @@ def _whiten(first, second, spec):
     inverse = lax.rsqrt(variance_x)
     n = [x * inverse for x in first]
     area = cross(n, second)
-    sharp = dot(area, area)
-    blurred = sharp + dilation * (1 + dot(second, second) / variance_x)
+    sharp_variance = dot(area, area)
+    blurred_variance = sharp_variance + dilation * (
+        1 + dot(second, second) / variance_x
+    )
     shear = dot(n, second) * inverse
     half = jnp.sqrt(jnp.asarray(0.5, variance_x.dtype))
-    whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred)])
-    ratio = sharp / blurred
+    whitening = jnp.stack([half * inverse, shear, half * lax.rsqrt(blurred_variance)])
+    ratio = sharp_variance / blurred_variance
     small = ratio < MIN_COMPENSATION_SQ
     # The gradient of sqrt is infinite at 0, so the unused branch gets a 1.
     compensation = jnp.where(

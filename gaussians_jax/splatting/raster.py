@@ -184,9 +184,9 @@ def _layout(footprints, size, spec):
         # times as long. Chunks have a minimum size, because each also passes over all
         # tiles: 200,000 Gaussians at 800x800 take 0.93 of the time in two chunks
         # instead of four.
-        packed = 1 << (32 - grid.tiles.bit_length())
-        if gaussians > packed >= LEAST_PACKED_CAPACITY:
-            capacity = min(capacity, packed)
+        packed_capacity = 1 << (32 - grid.tiles.bit_length())
+        if gaussians > packed_capacity >= LEAST_PACKED_CAPACITY:
+            capacity = min(capacity, packed_capacity)
     return Layout(spec, grid, step, capacity)
 
 
@@ -284,11 +284,13 @@ def _stream(layout, rects, table, through=False):
     def body(carry):
         cursor, state, residuals = carry
         isects, cursor = _next_intersections(layout, cursor, rects, table, state)
-        state, used = blending.blend(state, isects, rows, spec, grid, step, through)
+        state, used_count = blending.blend(
+            state, isects, rows, spec, grid, step, through
+        )
         # The backward pass skips the pairs that early stopping skipped.
-        isects = isects._replace(ends=isects.starts + used)
+        isects = isects._replace(ends=isects.starts + used_count)
         chunks = jax.tree.map(
-            lambda all_, one: all_.at[residuals.chunk_count].set(one, mode="drop"),
+            lambda all_, chunk: all_.at[residuals.chunk_count].set(chunk, mode="drop"),
             residuals.chunks,
             isects,
         )

@@ -285,7 +285,7 @@ def _check(arrays: dict[str, Any], sh_degree, coefficients):
     sizes |= dict(zip(last, colors.shape[-len(last) :], strict=False))
     if sh_degree is not None:
         sizes["3"] = 3
-    expected = {
+    expected_axes = {
         "means": "N 3",
         "quats": "N 4",
         "scales": "N 3",
@@ -299,9 +299,9 @@ def _check(arrays: dict[str, Any], sh_degree, coefficients):
     }
     per_camera = colors.ndim == len(batch) + len(last) + 2
     if per_camera:
-        expected["colors"] = "C " + expected["colors"]
+        expected_axes["colors"] = "C " + expected_axes["colors"]
     for name, value in arrays.items():
-        axes = expected[name].split()
+        axes = expected_axes[name].split()
         shape = (*batch, *(sizes[axis] for axis in axes))
         if value is not None and value.shape != shape:
             raise ValueError(
@@ -336,11 +336,11 @@ def _color_axes(colors, sh_degree):
             f"sh_degree must be an integer from 0 to {harmonics.MAX_DEGREE} or None, "
             f"got {sh_degree}"
         )
-    needed = (sh_degree + 1) ** 2
-    if colors.ndim < 3 or colors.shape[-2] < needed:
+    sh_count = (sh_degree + 1) ** 2
+    if colors.ndim < 3 or colors.shape[-2] < sh_count:
         raise ValueError(
             f"colors must have shape [..., N, K, 3] or [..., C, N, K, 3] with K >= "
-            f"{needed} for sh_degree={sh_degree}, got {colors.shape}"
+            f"{sh_count} for sh_degree={sh_degree}, got {colors.shape}"
         )
     return ("K", "3")
 
@@ -394,8 +394,8 @@ def _camera_image(settings, gaussians, colors, view):
         color = color + view.background * transmittance[..., None]
         image = jnp.concatenate([color, image[..., color.shape[-1] :]], axis=-1)
     if mode.endswith("ED"):
-        expected = image[..., -1:] / jnp.maximum(alpha, LEAST_ALPHA)
-        image = jnp.concatenate([image[..., :-1], expected], axis=-1)
+        expected_depth = image[..., -1:] / jnp.maximum(alpha, LEAST_ALPHA)
+        image = jnp.concatenate([image[..., :-1], expected_depth], axis=-1)
 
     rects = binning.tile_rects(
         lax.stop_gradient(footprints.mean_px),

@@ -74,23 +74,25 @@ def render(
     if not (spec.distorted or isinstance(camera.radial, jax.core.Tracer)):
         _refuse_distortion(camera)
     footprints = projection.project(gaussians, camera, size, spec)
-    displaced = footprints
+    offset_footprints = footprints
     if mean2d_offset is not None:
-        displaced = footprints._replace(mean_px=footprints.mean_px + mean2d_offset)
+        offset_footprints = footprints._replace(
+            mean_px=footprints.mean_px + mean2d_offset
+        )
     values = [widened(colors)]
     if depth:
         values.append(footprints.depth[:, None])
     if features is not None:
         values.append(widened(features))
     image, transmittance = bands.rasterize(
-        displaced, jnp.concatenate(values, axis=1), size, spec, devices
+        offset_footprints, jnp.concatenate(values, axis=1), size, spec, devices
     )
     color, alpha = image[..., :3], 1 - transmittance
     if background is not None:
         color = color + background * transmittance[..., None]
-    expected = image[..., 3] / jnp.maximum(alpha, LEAST_ALPHA) if depth else None
+    expected_depth = image[..., 3] / jnp.maximum(alpha, LEAST_ALPHA) if depth else None
     extras = None if features is None else image[..., 4 if depth else 3 :]
-    return Frame(Rendering(color, alpha, expected), footprints, extras)
+    return Frame(Rendering(color, alpha, expected_depth), footprints, extras)
 
 
 @checked
