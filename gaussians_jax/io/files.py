@@ -76,13 +76,13 @@ def load(path: str | os.PathLike, *, drop_broken: bool = False) -> Loaded:
         raise FileError(f"{path}: no such file")
     try:
         rows, notes = readers[path.suffix.lower()](path)
-        rows, dropped = _without_broken(rows, drop_broken)
+        rows, dropped_count = _without_broken(rows, drop_broken)
     except FileError:  # it names the path already
         raise
     except (ValueError, OSError, MemoryError, OverflowError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileError(f"{path}: {reason}") from error
-    return Loaded(Splats(*map(jnp.asarray, rows)), dropped, notes)
+    return Loaded(Splats(*map(jnp.asarray, rows)), dropped_count, notes)
 
 
 def save(
@@ -141,8 +141,8 @@ def _without_broken(rows, drop):
     finite = np.ones(len(rows.mean), bool)
     for leaf in rows:
         finite &= np.isfinite(leaf.reshape(len(finite), -1)).all(axis=1)
-    broken = int((~finite).sum())
-    if broken and not drop:
+    broken_count = int((~finite).sum())
+    if broken_count and not drop:
         first = np.flatnonzero(~finite)[0]
         name = next(
             name
@@ -150,12 +150,12 @@ def _without_broken(rows, drop):
             if not np.isfinite(leaf[first]).all()
         )
         raise ValueError(
-            f"row {first} has a {name} that is not finite, {broken} such rows in "
+            f"row {first} has a {name} that is not finite, {broken_count} such rows in "
             "total; load with drop_broken=True to skip them"
         )
     if not finite.any():
         raise ValueError("every row has a value that is not finite")
-    return Splats(*(leaf[finite] for leaf in rows)), broken
+    return Splats(*(leaf[finite] for leaf in rows)), broken_count
 
 
 # The PLY of 3D Gaussian splatting ---------------------------------------------------
@@ -200,8 +200,8 @@ def _read_ply(path):
         sh_dc=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
         sh_rest=np.ascontiguousarray(channels.transpose(0, 2, 1)),
     )
-    expected = {*_REQUIRED, *rest, "nx", "ny", "nz"}
-    extra = [name for name in names if name not in expected]
+    expected_names = {*_REQUIRED, *rest, "nx", "ny", "nz"}
+    extra = [name for name in names if name not in expected_names]
     extra += [f"element {part.name}" for part in ply.elements if part.name != "vertex"]
     notes = (f"ignored: {', '.join(extra)}",) if extra else ()
     trailing = path.stat().st_size - len(header) - vertex.nbytes
@@ -331,5 +331,5 @@ def _nearest_byte(values):
 
 
 def _read_spz(path):
-    unpacked = spz.decode(safe_files.read_bytes(path, MOST_BYTES))
-    return Splats(*unpacked[:-1]), unpacked.notes
+    contents = spz.decode(safe_files.read_bytes(path, MOST_BYTES))
+    return Splats(*contents[:-1]), contents.notes

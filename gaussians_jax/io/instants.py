@@ -98,24 +98,26 @@ def written_rows(model: Model, state: TrainState) -> Splats:
     return model.stages.rows(state.params)
 
 
-def _as_rows(rows: Splats, deformed: Gaussians) -> Splats:
+def _as_rows(rows: Splats, gaussians: Gaussians) -> Splats:
     """Invert the activations of the deformed Gaussians."""
-    trained = splats.activate(rows)
+    canonical = splats.activate(rows)
     # Values that the motion does not change keep their trained parameters. The logit of
     # an opacity that rounds to 1 would be infinite, and that of 0 marks an inactive
     # Gaussian, which no motion changes.
-    eps = jnp.finfo(deformed.opacity.dtype).eps
-    opacity = jnp.clip(deformed.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
+    eps = jnp.finfo(gaussians.opacity.dtype).eps
+    opacity = jnp.clip(gaussians.opacity, jnp.finfo(eps.dtype).tiny, 1 - eps)
     logit = jnp.log(opacity) - jnp.log1p(-opacity)
     smallest = math.exp(splats.LOG_SCALE_RANGE[0])
     # A linear scale rule may make scales negative, and rendering squares them.
-    log_scale = jnp.log(jnp.maximum(jnp.abs(deformed.scale), smallest))
-    unchanged = (deformed.opacity == trained.opacity) | ~splats.active_mask(rows)
+    log_scale = jnp.log(jnp.maximum(jnp.abs(gaussians.scale), smallest))
+    keeps_opacity = (gaussians.opacity == canonical.opacity) | ~splats.active_mask(rows)
     return rows._replace(
-        mean=deformed.mean,
-        quaternion=deformed.quaternion,
-        log_scale=jnp.where(deformed.scale == trained.scale, rows.log_scale, log_scale),
-        opacity_logit=jnp.where(unchanged, rows.opacity_logit, logit),
+        mean=gaussians.mean,
+        quaternion=gaussians.quaternion,
+        log_scale=jnp.where(
+            gaussians.scale == canonical.scale, rows.log_scale, log_scale
+        ),
+        opacity_logit=jnp.where(keeps_opacity, rows.opacity_logit, logit),
     )
 
 

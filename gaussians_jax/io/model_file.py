@@ -60,14 +60,14 @@ def save(path: str | os.PathLike, params: Params, description: dict[str, Any]) -
     arrays: dict[str, np.ndarray] = {}
     try:
         structure = _flatten(params._replace(rows=rows), "params", arrays)
-        described = specs.as_json(description)
+        description_json = specs.as_json(description)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; not written") from error
     about = {
         "format": FORMAT,
         "version": VERSION,
         "params": structure,
-        "description": described,
+        "description": description_json,
     }
     content = io.BytesIO()
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
@@ -194,14 +194,14 @@ def _flatten(tree, name, arrays):
     return {"array": name}
 
 
-def _trusted_classes(about, trusted):
+def _trusted_classes(about, trusted_names):
     """Import classes of other packages that the file names and the caller trusts."""
     names = (
         *extensions.names_in(about["params"], "record"),
         *extensions.names_in(about["description"], specs.TYPE),
     )
     for name in names:
-        if name not in trusted:
+        if name not in trusted_names:
             raise ValueError(
                 f"it names {name!r} of another package, whose code would be executed; "
                 f"load it with trusted=({name!r},) if you trust it"

@@ -148,20 +148,20 @@ def seen_in_training(
     total, color = 0.0, 0.0
     for row in evaluation.spread(capture.train, MOST_VIEWS):
         view = evaluation.resized(evaluation.view_of(capture, row), capture.size, size)
-        deformed = at(float(view.time))
-        variants = [(deformed, view.camera)]
+        gaussians = at(float(view.time))
+        variants = [(gaussians, view.camera)]
         if moves.any():
-            opacity = np.array(deformed.opacity)
+            opacity = np.array(gaussians.opacity)
             opacity[moves] = 0
-            static = deformed._replace(opacity=jax.device_put(opacity))
+            static = gaussians._replace(opacity=jax.device_put(opacity))
             variants.append((static, view.camera))
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *variants)
         weights = list(
-            data_parallel.rows_on_devices(_weights, (size, raster_spec), stacked)
+            data_parallel.rows_on_devices(_weights, (size, raster_spec), batch)
         )
         most = np.maximum(most, np.max(weights, axis=0) * factor**2)
         weight = np.sum(weights, axis=0)
-        colors = color_toward(coefficients, deformed.mean, view.camera.position)
+        colors = color_toward(coefficients, gaussians.mean, view.camera.position)
         total = total + weight
         color = color + weight[:, None] * jax.device_get(colors)
     total_weight = np.maximum(total, np.finfo(np.float32).tiny)

@@ -75,11 +75,11 @@ def encode(rows: Splats) -> bytes:
 
 def _positions(mean):
     """Bytes of the symmetric logarithm of coordinates, low and high, and its bounds."""
-    squeezed = np.sign(mean) * np.log1p(np.abs(mean))
+    log_mean = np.sign(mean) * np.log1p(np.abs(mean))
     # Bounds as a reader has them, in float32.
-    low = squeezed.min(axis=0).astype(np.float32).astype(np.float64)
-    high = squeezed.max(axis=0).astype(np.float32).astype(np.float64)
-    share = (squeezed - low) / np.where(high > low, high - low, 1)
+    low = log_mean.min(axis=0).astype(np.float32).astype(np.float64)
+    high = log_mean.max(axis=0).astype(np.float32).astype(np.float64)
+    share = (log_mean - low) / np.where(high > low, high - low, 1)
     level = np.clip(np.rint(65535 * share), 0, 65535).astype(np.uint16)
     return level & 255, level >> 8, {"mins": low.tolist(), "maxs": high.tolist()}
 
@@ -97,14 +97,14 @@ def _in_codebook(values):
     Half of the entries start at quantiles, and half evenly spaced, because few values
     in the tails attract no entries. Lloyd's algorithm improves both.
     """
-    ordered = np.sort(values, axis=None)
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    ranks = np.linspace(0, len(ordered) - 1, CODEBOOK // 2).round().astype(int)
-    spaced = np.linspace(ordered[0], ordered[-1], CODEBOOK // 2)
-    book = np.sort(np.concatenate([ordered[ranks], spaced]))
+    sorted_values = np.sort(values, axis=None)
+    sums = np.concatenate([[0.0], np.cumsum(sorted_values)])
+    ranks = np.linspace(0, len(sorted_values) - 1, CODEBOOK // 2).round().astype(int)
+    grid = np.linspace(sorted_values[0], sorted_values[-1], CODEBOOK // 2)
+    book = np.sort(np.concatenate([sorted_values[ranks], grid]))
     for _ in range(LLOYD_STEPS):
-        ends = np.searchsorted(ordered, (book[1:] + book[:-1]) / 2)
-        ends = np.concatenate([[0], ends, [len(ordered)]])
+        ends = np.searchsorted(sorted_values, (book[1:] + book[:-1]) / 2)
+        ends = np.concatenate([[0], ends, [len(sorted_values)]])
         count = np.diff(ends)
         mean = np.diff(sums[ends]) / np.maximum(count, 1)
         # Rounding of sums must not unsort the entries.
@@ -148,19 +148,19 @@ def _palette(vectors):
         starts = np.flatnonzero(np.diff(group[order], prepend=-1))
         size = np.diff(starts, append=len(order))
         number = np.repeat(np.arange(len(starts)), size)  # of sorted rows
-        ordered = different[order]
-        mean = np.add.reduceat(ordered, starts) / size[:, None]
-        variance = np.add.reduceat((ordered - mean[number]) ** 2, starts)
+        sorted_vectors = different[order]
+        mean = np.add.reduceat(sorted_vectors, starts) / size[:, None]
+        variance = np.add.reduceat((sorted_vectors - mean[number]) ** 2, starts)
         widest = np.argmax(variance, axis=1)[number]
-        value = ordered[np.arange(len(order)), widest]
+        value = sorted_vectors[np.arange(len(order)), widest]
         inner = np.lexsort((value, number))
         rank = np.arange(len(order)) - starts[number]  # of rows sorted by value
         group[order[inner]] = 2 * number + (rank >= (size[number] + 1) // 2)
-    used, group = np.unique(group, return_inverse=True)
-    sums = np.zeros((len(used), vectors.shape[1]))
+    group_ids, group = np.unique(group, return_inverse=True)
+    sums = np.zeros((len(group_ids), vectors.shape[1]))
     labels = group[labels]
     np.add.at(sums, labels, vectors)
-    return labels, sums / np.bincount(labels, minlength=len(used))[:, None]
+    return labels, sums / np.bincount(labels, minlength=len(group_ids))[:, None]
 
 
 def _image(pixels):
@@ -168,9 +168,9 @@ def _image(pixels):
     count, channels = pixels.shape
     width = math.ceil(math.sqrt(count))
     height = math.ceil(count / width)
-    padded = np.zeros((height * width, channels), np.uint8)
-    padded[:count] = pixels
-    return _webp(padded.reshape(height, width, channels))
+    padded_pixels = np.zeros((height * width, channels), np.uint8)
+    padded_pixels[:count] = pixels
+    return _webp(padded_pixels.reshape(height, width, channels))
 
 
 def _webp(pixels):

@@ -90,11 +90,11 @@ def fit(instants: Instants) -> Curves:
     """
     times = np.linspace(0, 1, len(instants.mean))
     opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
-    elapsed = times - 0.5
+    time_offset = times - 0.5
     weight = instants.opacity.astype(np.float64) + FAINTEST
     means = instants.mean.astype(np.float64)
-    position = _polynomials(elapsed, weight, means, 4)
-    turn = _polynomials(elapsed, weight, instants.quaternion.astype(np.float64), 2)
+    position = _polynomials(time_offset, weight, means, 4)
+    turn = _polynomials(time_offset, weight, instants.quaternion.astype(np.float64), 2)
     # Change of variables from the time since the middle to the time since the center.
     shift = (center - 0.5)[:, None]
     a, b, c, d = np.moveaxis(position, 1, 0)
@@ -112,9 +112,9 @@ def fit(instants: Instants) -> Curves:
     )
 
 
-def _polynomials(elapsed, weight, values, terms):
+def _polynomials(time_offset, weight, values, terms):
     """Fit coefficients [gaussians, terms, parts] to [times, gaussians, parts]."""
-    powers = elapsed[:, None] ** np.arange(terms)
+    powers = time_offset[:, None] ** np.arange(terms)
     squares = np.einsum("tn,ti,tj->nij", weight, powers, powers, optimize=True)
     moments = np.einsum("tn,ti,tnd->nid", weight, powers, values, optimize=True)
     return np.linalg.solve(squares, moments)
@@ -130,15 +130,15 @@ def _bells(times, opacity):
     logarithm = np.log(np.maximum(opacity, 1e-4))[..., None]
     # The error of the opacity is its logarithm's error times the opacity.
     weight = np.maximum(opacity, 1e-4) ** 2
-    elapsed = times - 0.5
-    parabola = _polynomials(elapsed, weight, logarithm, 3)[..., 0]
+    time_offset = times - 0.5
+    parabola = _polynomials(time_offset, weight, logarithm, 3)[..., 0]
     opens_down = parabola[:, 2] < -((1 / ALWAYS) ** 2)
     curvature = np.where(opens_down, -parabola[:, 2], 1.0)
     offset = parabola[:, 1] / (2 * curvature)
     opens_down &= np.abs(offset) < FARTHEST_CENTER
     offset = np.where(opens_down, offset, 0.0)
     height = np.exp(np.minimum(parabola[:, 0] + curvature * offset**2, 0))
-    bell = height * np.exp(-curvature * (elapsed[:, None] - offset) ** 2)
+    bell = height * np.exp(-curvature * (time_offset[:, None] - offset) ** 2)
     is_better = ((bell - opacity) ** 2).sum(0) < ((constant - opacity) ** 2).sum(0)
     use_bell = opens_down & is_better
     return (
@@ -158,11 +158,13 @@ def at(curves: Curves, time: float) -> Gaussians:
     Returns:
       The Gaussians.
     """
-    elapsed = (time - curves.center)[:, None]
+    time_offset = (time - curves.center)[:, None]
     first, second, third = np.moveaxis(curves.motion, 1, 0)
-    mean = curves.position + elapsed * (first + elapsed * (second + elapsed * third))
-    turn = curves.quaternion + curves.turning * elapsed
-    bell = np.exp(-((elapsed[:, 0] / curves.width) ** 2))
+    mean = curves.position + time_offset * (
+        first + time_offset * (second + time_offset * third)
+    )
+    turn = curves.quaternion + curves.turning * time_offset
+    bell = np.exp(-((time_offset[:, 0] / curves.width) ** 2))
     parts = mean, turn, curves.scale, curves.opacity * bell
     return Gaussians(*(jnp.asarray(part, jnp.float32) for part in parts))
 

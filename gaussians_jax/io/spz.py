@@ -135,10 +135,10 @@ def encode(rows: Unpacked, version: int = 3) -> bytes:
         return gzip.compress(head + b"\0" + b"".join(parts), mtime=0)
     zstd = _zstandard()
     parts = [part for part in parts if part]
-    packed = [zstd.ZstdCompressor().compress(part) for part in parts]
-    sizes = [(len(p), len(part)) for p, part in zip(packed, parts, strict=True)]
+    streams = [zstd.ZstdCompressor().compress(part) for part in parts]
+    sizes = [(len(p), len(part)) for p, part in zip(streams, parts, strict=True)]
     table = b"".join(struct.pack("<QQ", *size) for size in sizes)
-    return head + struct.pack("<BI12x", len(parts), 32) + table + b"".join(packed)
+    return head + struct.pack("<BI12x", len(parts), 32) + table + b"".join(streams)
 
 
 def logit_of_byte(opacity: np.ndarray) -> np.ndarray:
@@ -204,12 +204,12 @@ def _open_zstd(data):
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MOST_WINDOW)
     parts = []
     for index, size in enumerate(nonempty):
-        packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * index)
-        piece = data[start : start + packed]
-        if unpacked != size or len(piece) < packed:
+        packed_size, unpacked_size = struct.unpack_from("<QQ", data, table + 16 * index)
+        piece = data[start : start + packed_size]
+        if unpacked_size != size or len(piece) < packed_size:
             raise ValueError(
-                f"stream {index} has {len(piece)} of {packed} bytes and decompresses "
-                f"to {unpacked}; {count} Gaussians need {size}"
+                f"stream {index} has {len(piece)} of {packed_size} bytes and "
+                f"decompresses to {unpacked_size}; {count} Gaussians need {size}"
             )
         try:
             # One byte more reveals a longer stream. Frames need not store their size.
@@ -220,7 +220,7 @@ def _open_zstd(data):
         if len(part) != size:
             raise ValueError(f"stream {index} holds {len(part)} bytes, not {size}")
         parts.append(np.frombuffer(part, np.uint8))
-        start += packed
+        start += packed_size
     if len(parts) < len(sizes):
         parts.append(np.zeros(0, np.uint8))
     return (version, count, degree, bits, flags), parts
@@ -272,8 +272,8 @@ def _first_three(bytes_):
 
 
 def _pack_first_three(quaternion):
-    signed = quaternion * np.where(quaternion[:, :1] < 0, -1, 1)
-    return _byte(signed[:, 1:] * 127.5 + 127.5)
+    canonical_quaternion = quaternion * np.where(quaternion[:, :1] < 0, -1, 1)
+    return _byte(canonical_quaternion[:, 1:] * 127.5 + 127.5)
 
 
 def _smallest_three(bytes_):
@@ -296,12 +296,12 @@ def _smallest_three(bytes_):
 def _pack_smallest_three(quaternion):
     xyzw = quaternion[:, [1, 2, 3, 0]]
     largest = np.abs(xyzw).argmax(axis=1)
-    signed = xyzw * np.sign(xyzw[np.arange(len(xyzw)), largest])[:, None]
+    canonical_xyzw = xyzw * np.sign(xyzw[np.arange(len(xyzw)), largest])[:, None]
     word = largest.astype(np.uint32)
     for axis in range(4):
-        size = np.floor(np.abs(signed[:, axis]) * SMALLEST_THREE_STEPS + 0.5)
+        size = np.floor(np.abs(canonical_xyzw[:, axis]) * SMALLEST_THREE_STEPS + 0.5)
         bits = np.minimum(size, 511).astype(np.uint32)
-        bits |= (signed[:, axis] < 0).astype(np.uint32) << np.uint32(9)
+        bits |= (canonical_xyzw[:, axis] < 0).astype(np.uint32) << np.uint32(9)
         word = np.where(largest == axis, word, (word << np.uint32(10)) | bits)
     return word.astype("<u4")[:, None].view(np.uint8)
 

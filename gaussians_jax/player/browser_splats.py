@@ -46,8 +46,8 @@ def splatting(spec, metadata, without: tuple[str, ...]) -> Splatting:
         appearance: Int[Array, ""],
         position: Float[Array, "3"],
     ):
-        prepared = deformation.prepare(effects, params)
-        gaussians = deformation.deform(effects, params, prepared, time)
+        cache = deformation.prepare(effects, params)
+        gaussians = deformation.deform(effects, params, cache, time)
         rows = deformation.rendered_rows(effects, params)
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
         coefficients = splats.active_harmonics(rows, degree)

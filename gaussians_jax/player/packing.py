@@ -60,22 +60,24 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
         values = getattr(instants, name).astype(np.float64)
         values = values.reshape(*values.shape[:2], -1)
         reference = (values.min(axis=0) + values.max(axis=0)) / 2
-        stored = (reference - shift) / scale
-        stored = stored if dtype is np.float32 else np.round(stored)
-        stored = stored.astype(dtype)
-        # Relative to the stored value, so that offsets also correct its rounding.
-        offset = values - (shift + scale * stored.astype(np.float64))
+        reference_codes = (reference - shift) / scale
+        reference_codes = (
+            reference_codes if dtype is np.float32 else np.round(reference_codes)
+        )
+        reference_codes = reference_codes.astype(dtype)
+        # Relative to the rounded reference, so that offsets also correct its rounding.
+        offset = values - (shift + scale * reference_codes.astype(np.float64))
         threshold = still_distance if name == "mean" else STILL[name]
         (rows,) = np.nonzero(np.abs(values - reference).max(axis=(0, 2)) > threshold)
         largest = np.iinfo(OFFSET_TYPES[name]).max
         step = (np.abs(offset[:, rows]).max(axis=(0, 2)) / largest).astype(np.float32)
         steps = np.maximum(step, np.finfo(np.float32).tiny)[None, :, None]
-        quantized = np.clip(np.round(offset[:, rows] / steps), -largest, largest)
-        arrays.add(name, stored, scale, shift)
+        offset_codes = np.clip(np.round(offset[:, rows] / steps), -largest, largest)
+        arrays.add(name, reference_codes, scale, shift)
         arrays.add(f"{name}.rows", rows.astype(np.uint32))
         arrays.add(f"{name}.step", step)
-        arrays.add(f"{name}.change", quantized.astype(OFFSET_TYPES[name]))
-    return arrays.packed()
+        arrays.add(f"{name}.change", offset_codes.astype(OFFSET_TYPES[name]))
+    return arrays.build()
 
 
 class _Arrays:
@@ -99,7 +101,7 @@ class _Arrays:
         self._parts.append(content)
         self._size += len(content)
 
-    def packed(self):
+    def build(self):
         """Return all arrays."""
         return Packed(self._entries, b"".join(self._parts))
 

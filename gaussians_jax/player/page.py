@@ -71,13 +71,19 @@ def write(
     at, rows = gaussians_at(model, state), written_rows(model, state)
     statistics = seen_in_training(at, rows, raster, degree, capture)
     count = count_for(capture)
-    instants, packed = _pack(at, rows, capture, statistics, count)
-    if len(packed.data) > MOST_BYTES:
-        fewer = int(count * MOST_BYTES / len(packed.data))
+    instants, packed_scene = _pack(at, rows, capture, statistics, count)
+    if len(packed_scene.data) > MOST_BYTES:
+        fewer = int(count * MOST_BYTES / len(packed_scene.data))
         count = max(fewer, FEWEST_INSTANTS)
-        instants, packed = _pack(at, rows, capture, statistics, count)
+        instants, packed_scene = _pack(at, rows, capture, statistics, count)
     return compose(
-        path, title, packed, _about(instants, packed, capture), raster, capture, poster
+        path,
+        title,
+        packed_scene,
+        _about(instants, packed_scene, capture),
+        raster,
+        capture,
+        poster,
     )
 
 
@@ -185,11 +191,11 @@ def _still_distance(instants: Instants, capture: Capture) -> np.ndarray:
     return packing.STILL_PX * nearest
 
 
-def _about(instants, packed, capture):
+def _about(instants, packed_scene, capture):
     count = instants.mean.shape[1]
     return (
-        f"{count:,} Gaussians, {packing.moving_rows(packed):,} of them moving, at "
-        f"{len(instants.mean)} times. {instants.left_out:,} that no camera saw are "
+        f"{count:,} Gaussians, {packing.moving_rows(packed_scene):,} of them moving, "
+        f"at {len(instants.mean)} times. {instants.left_out:,} that no camera saw are "
         f"left out. One scene unit is {1 / capture.scale:.3g} of the capture's."
     )
 
