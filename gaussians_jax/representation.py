@@ -141,8 +141,8 @@ def save(
     about = {"spec": spec, "metadata": metadata, "step": int(state.step)}
     size = model_file.save(folder / MODEL, state.params, about)
     effects = scene.all_effects(spec, metadata)
-    rendered = deformation.rendered_rows(effects, state.params)
-    files.save(folder / "gaussians.ply", rendered)
+    rows = deformation.rendered_rows(effects, state.params)
+    files.save(folder / "gaussians.ply", rows)
     notes = []
     if spec.raster.antialiased:
         notes.append(
@@ -151,11 +151,11 @@ def save(
         )
     if all(effect.deform is None for effect in effects):
         return Saved(size, tuple(notes))
-    coded = None
+    coded_size = None
     notes.append("gaussians.ply holds the canonical Gaussians, without their motion.")
     if isinstance(spec.motion, AnchorMotionSpec):
         features, others = anchor_motion.coded_bytes(state.params, spec.motion)
-        coded = features + others
+        coded_size = features + others
         notes.append(
             f"The features of the anchors take {features / 1e6:.2f} MB with entropy "
             f"coding by the learned distribution, the other parameters "
@@ -168,7 +168,7 @@ def save(
             "11.3 MB and 163 frames per second on an A100, for other scenes, so the "
             "numbers are not comparable."
         )
-    return Saved(size, tuple(notes), coded)
+    return Saved(size, tuple(notes), coded_size)
 
 
 def player(
@@ -318,12 +318,14 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     Returns:
       The preset, the overrides and notes.
     """
-    preprocessed = record.cached(capture, CACHE / "evidence")
-    reason = usable_paths.unusable(preprocessed)
-    static = bool(reason) and usable_paths.is_static(preprocessed, capture.times)
-    inspected = preprocessed.unusable or (reason and not static)
-    inspection_result = _findings(capture, preprocessed) if inspected else ()
-    motion = next((one for one in inspection_result if one.effect == MOTION), None)
+    preprocessing = record.cached(capture, CACHE / "evidence")
+    reason = usable_paths.unusable(preprocessing)
+    static = bool(reason) and usable_paths.is_static(preprocessing, capture.times)
+    needs_inspection = preprocessing.unusable or (reason and not static)
+    inspection_result = _findings(capture, preprocessing) if needs_inspection else ()
+    motion = next(
+        (finding for finding in inspection_result if finding.effect == MOTION), None
+    )
     start: tuple[str, ...]
     name, start, notes = f"{UNTRACKED}-small", (FROM_REST,), []
     if findings.is_collection(inspection_result):
@@ -340,7 +342,7 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
     else:
         name, start, _ = _best(True, seconds)
     spec = specs.override(presets.PRESETS[name], start)
-    paths = usable_paths.known_paths(preprocessed)
+    paths = usable_paths.known_paths(preprocessing)
     share = 1.0 if reason else float(paths.known.mean())
     overrides = start + capacity(spec, capture.size, share, seconds)
     if overrides != start:
@@ -358,21 +360,21 @@ def default_preset(capture: Capture, seconds: float | int | None = None) -> Choi
         if knots > spec.motion.knots:
             overrides += (f"motion.knots={knots}",)
             notes.append(f"for {frames} frames")
-    other = None if reason else _alternative(preprocessed, capture.size, seconds)
+    other = None if reason else _alternative(preprocessing, capture.size, seconds)
     return Choice(name, overrides, tuple(notes), other)
 
 
-def _findings(capture, preprocessed):
+def _findings(capture, preprocessing):
     """Inspect the motion, and the light where nothing can be tracked."""
-    effects = (MOTION, TRANSIENT, LIGHT) if preprocessed.unusable else (MOTION,)
+    effects = (MOTION, TRANSIENT, LIGHT) if preprocessing.unusable else (MOTION,)
     return inspection.find(capture, effects, CACHE / "evidence")
 
 
-def _alternative(preprocessed, size, seconds):
+def _alternative(preprocessing, size, seconds):
     """Return the static choice if tracks hardly determine the motion, or None."""
-    deviation = np.median(usable_paths.known_paths(preprocessed).depth_deviation)
-    covered = usable_paths.coverage(preprocessed)
-    if covered >= WELL_COVERED and deviation <= WELL_PLACED:
+    deviation = np.median(usable_paths.known_paths(preprocessing).depth_deviation)
+    coverage = usable_paths.coverage(preprocessing)
+    if coverage >= WELL_COVERED and deviation <= WELL_PLACED:
         return None
     static, start, _ = _best(False, seconds)
     spec = specs.override(presets.PRESETS[static], start)

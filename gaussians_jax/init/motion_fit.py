@@ -369,9 +369,11 @@ def fit(
     start = padded(start)
 
     def by_frame(values):
-        known = np.where(valid[..., None], values, 0)
-        unused = len(start.canonical) - size
-        return captured(np.moveaxis(np.pad(known, [(0, unused), (0, 0), (0, 0)]), 1, 0))
+        masked_values = np.where(valid[..., None], values, 0)
+        padding = len(start.canonical) - size
+        return captured(
+            np.moveaxis(np.pad(masked_values, [(0, padding), (0, 0), (0, 0)]), 1, 0)
+        )
 
     target, weight = by_frame(position), by_frame(valid[..., None])[..., 0]
     # Component along the rays to remove from the distances.
@@ -391,8 +393,8 @@ def fit(
             length = jnp.sqrt(jnp.sum(offset**2, axis=-1) + (SOFT * unit) ** 2)
             return jnp.sum(length * weight)
 
-        selected = target[frames], weight[frames], ray_part[frames]
-        total = jnp.sum(jax.vmap(frame_distance)(frame_times[frames], *selected))
+        observations = target[frames], weight[frames], ray_part[frames]
+        total = jnp.sum(jax.vmap(frame_distance)(frame_times[frames], *observations))
         return total / jnp.maximum(jnp.sum(weight[frames]), 1)
 
     def loss(points, key):

@@ -106,10 +106,12 @@ def _seeds(effect, points, paths, evidence, views, times, unit, spec):
     canonical, padded_fit = np.asarray(points.canonical), motion_fit.padded(points)
     visibility = paths.known.mean(axis=1).astype(np.float32)
     positions_at = programs.Program(motion_fit.positions_at, effect)
-    fitted = np.stack(
+    fitted_paths = np.stack(
         [np.asarray(positions_at(padded_fit, time))[: len(canonical)] for time in times]
     )
-    depth = moving_depths(evidence, paths, views.depth_of(np.moveaxis(fitted, 0, 1)))
+    depth = moving_depths(
+        evidence, paths, views.depth_of(np.moveaxis(fitted_paths, 0, 1))
+    )
     frame, row, column = np.nonzero(depth > 0)
     # Twice as many as needed, because some are dropped.
     selection = rng.permutation(len(frame))[: 2 * spec.moving_points]
@@ -128,38 +130,38 @@ def _seeds(effect, points, paths, evidence, views, times, unit, spec):
         pixels = np.flatnonzero(frame == current)
         pixel = np.stack([column[pixels], row[pixels]], -1)
         ray = view_set.rays(views, int(current))[row[pixels], column[pixels]]
-        observed = (
+        pixel_position = (
             views.position[current]
             + ray * depth[current][row[pixels], column[pixels], None]
         )
-        position_then = fitted[current]
-        distance, neighbors, weights = _carriers(position_then, observed)
+        position_then = fitted_paths[current]
+        distance, neighbors, weights = _carriers(position_then, pixel_position)
 
-        def mixed(leaf, neighbors=neighbors, weights=weights):
+        def mix(leaf, neighbors=neighbors, weights=weights):
             return _mix(leaf, neighbors, weights)
 
-        pixel_rows = None if point_rows is None else jax.tree.map(mixed, point_rows)
-        start = observed + np.einsum(
+        pixel_rows = None if point_rows is None else jax.tree.map(mix, point_rows)
+        start = pixel_position + np.einsum(
             "nk,nkc->nc", weights, canonical[neighbors] - position_then[neighbors]
         )
 
-        def padded(leaf):
+        def pad(leaf):
             return np.pad(leaf, [(0, most - len(leaf))] + [(0, 0)] * (leaf.ndim - 1))
 
-        padded_rows = None if pixel_rows is None else jax.tree.map(padded, pixel_rows)
+        padded_rows = None if pixel_rows is None else jax.tree.map(pad, pixel_rows)
         canonical_position = start.astype(np.float32)
         for _ in range(ROUNDS):
-            padded_points = Points(padded(canonical_position), padded_rows, points.nets)
+            padded_points = Points(pad(canonical_position), padded_rows, points.nets)
             canonical_position = canonical_position - (
                 np.asarray(positions_at(padded_points, times[current]))[: len(pixels)]
-                - observed
+                - pixel_position
             )
             canonical_position = canonical_position.astype(np.float32)
         displacement = np.linalg.norm(canonical_position - start, axis=1)
         is_valid = (distance[:, 0] < FAR * unit) & (displacement < GONE * unit)
         positions.append(canonical_position[is_valid])
         times_of = np.full(int(is_valid.sum()), times[current])
-        spans.append(np.stack([times_of, mixed(visibility)[is_valid]]))
+        spans.append(np.stack([times_of, mix(visibility)[is_valid]]))
         colors.append(
             views.image[current][pixel[is_valid, 1], pixel[is_valid, 0]] / 255
         )
@@ -223,10 +225,10 @@ def moving_depths(
         if len(rows) < FEWEST_TRACKS or not len(row):
             continue
         pixel = np.stack([column, row], -1) + 0.5
-        known = paths.tracks.pixel[rows, frame]
+        track_pixel = paths.tracks.pixel[rows, frame]
         count = min(DEPTH_TRACKS, len(rows))
-        distance, neighbors = cKDTree(known).query(pixel, count)
-        offset = known[neighbors] - pixel[:, None]
+        distance, neighbors = cKDTree(track_pixel).query(pixel, count)
+        offset = track_pixel[neighbors] - pixel[:, None]
         plane = _on_planes(offset, depth[rows, frame][neighbors])
         plane[distance[:, 0] > DEPTH_REACH_PX * image_scale(mask.shape[1])] = 0
         depths[frame, row, column] = plane
@@ -334,9 +336,9 @@ def put_in(
     def set_last(leaf, values):
         if not len(values):  # no moving pixel has a depth
             return leaf
-        changed = np.array(leaf)
-        changed[len(leaf) - len(values) :] = np.asarray(values)
-        return changed
+        new_leaf = np.array(leaf)
+        new_leaf[len(leaf) - len(values) :] = np.asarray(values)
+        return new_leaf
 
     motion, *others = effects
     if tracked.nets is not None:

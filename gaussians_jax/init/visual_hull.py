@@ -88,9 +88,11 @@ def _inside(points, cameras, images, masks):
     rows = np.arange(len(points))
     for row, (image, mask) in enumerate(zip(images, masks, strict=True)):
         camera = jax.tree.map(lambda leaf, row=row: leaf[row], cameras)
-        padded = np.zeros(points.shape, np.float32)
-        padded[: len(rows)] = points[rows]
-        pixel, depth = (np.asarray(x)[: len(rows)] for x in _in_view(camera, padded))
+        padded_points = np.zeros(points.shape, np.float32)
+        padded_points[: len(rows)] = points[rows]
+        pixel, depth = (
+            np.asarray(x)[: len(rows)] for x in _in_view(camera, padded_points)
+        )
         in_image = (depth > 0) & np.all(
             (pixel >= 0) & (pixel < (width, height)), axis=1
         )

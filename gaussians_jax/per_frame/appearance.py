@@ -142,7 +142,7 @@ def fourier_features(mean: np.ndarray, bands: int) -> np.ndarray:
     return np.concatenate([np.sin(angle), np.cos(angle)], axis=1).astype(np.float32)
 
 
-def _hidden(spec: ColorNetworkSpec, code: int) -> MLPSpec:
+def _hidden_spec(spec: ColorNetworkSpec, code: int) -> MLPSpec:
     inputs = 6 * spec.bands + 3 + code
     return MLPSpec(inputs, spec.depth, spec.width, (), (), "relu", "he")
 
@@ -164,11 +164,11 @@ def init_network(
     Returns:
       The parameters.
     """
-    hidden, gate, out = jax.random.split(key, 3)
+    hidden_key, gate_key, out_key = jax.random.split(key, 3)
     return ColorNetwork(
-        mlp.init(_hidden(spec, code), hidden, dtype).hidden,
-        mlp.init_layer(gate, code, spec.width, "glorot", dtype).weight,
-        mlp.init_layer(out, spec.width, OUTPUTS, "glorot", dtype).weight,
+        mlp.init(_hidden_spec(spec, code), hidden_key, dtype).hidden,
+        mlp.init_layer(gate_key, code, spec.width, "glorot", dtype).weight,
+        mlp.init_layer(out_key, spec.width, OUTPUTS, "glorot", dtype).weight,
     )
 
 
@@ -191,10 +191,10 @@ def network_change(
     Returns:
       Gains and offsets of the channels.
     """
-    hidden = _hidden(spec, code.shape[0])
-    layers = mlp.with_known(hidden, mlp.MLP(params.hidden, {}), code)
+    hidden_spec = _hidden_spec(spec, code.shape[0])
+    layers = mlp.with_known(hidden_spec, mlp.MLP(params.hidden, {}), code)
     inputs = jnp.concatenate([features, colors], axis=1)
-    reduced_spec = dataclasses.replace(hidden, inputs=inputs.shape[1])
+    reduced_spec = dataclasses.replace(hidden_spec, inputs=inputs.shape[1])
     activations = mlp.hidden_features(reduced_spec, layers, inputs)
     weight = dense.product(code, params.gate)[:, None] * params.out
     return dense.product(activations, weight)
@@ -219,13 +219,13 @@ def recolor(
     Returns:
       Changed colors, not clipped.
     """
-    changed = exposed(shared, colors, code)
+    exposed_colors = exposed(shared, colors, code)
     if spec.network is None:
-        return changed
+        return exposed_colors
     assert shared.network is not None
     assert features is not None
     change = network_change(spec.network, shared.network, features, colors, code)
-    return changed + change[:, :3] * colors + change[:, 3:]
+    return exposed_colors + change[:, :3] * colors + change[:, 3:]
 
 
 def exposed(
@@ -263,14 +263,14 @@ class Bound:
             return schedules.log_linear(rate, spec.final * rate, self.steps)(step)
 
         network = falling(spec.learning_rate)
-        shared = Shared(
+        shared_rates = Shared(
             falling(spec.code_rate),
             network,
             None if spec.network is None else network,
             None if spec.sky is None else network,
         )
         features = None if spec.network is None else falling(spec.network.feature_rate)
-        return MotionParams(features, shared)
+        return MotionParams(features, shared_rates)
 
     def init(self, key: Key[Array, ""], gaussians: Splats) -> MotionParams:
         """Initialize codes of zero, which change no color."""
@@ -281,13 +281,13 @@ class Bound:
             fourier = fourier_features(np.asarray(gaussians.mean), spec.network.bands)
             features = jnp.asarray(fourier)
             network = init_network(network_key, spec.network, code)
-        shared = Shared(
+        shared_params = Shared(
             jnp.zeros((id_tables.rows_of(self.places), code), jnp.float32),
             jnp.eye(code, AFFINE, dtype=jnp.float32),
             network,
             None if spec.sky is None else sky.init(sky_key, spec.sky, code),
         )
-        return MotionParams(features, shared)
+        return MotionParams(features, shared_params)
 
     def code(
         self, params: MotionParams, appearance: Int[Array, ""]

@@ -131,12 +131,12 @@ def fit(
       The affine transform [3, 4].
     """
     is_valid = np.ones(image.shape[:2], bool) if valid is None else valid
-    rendered, truth = (
+    colors, truth = (
         image[is_valid].astype(np.float64),
         observed[is_valid].astype(np.float64),
     )
-    inputs = np.concatenate([rendered, np.ones((len(rendered), 1))], axis=1)
+    inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
     # The ridge leaves undetermined directions unchanged, as in an image of one color.
-    ridge = HELD * max(len(rendered), 1) * np.eye(4)
+    ridge = HELD * max(len(colors), 1) * np.eye(4)
     squares = inputs.T @ inputs + ridge
-    return np.linalg.solve(squares, inputs.T @ (truth - rendered)).T
+    return np.linalg.solve(squares, inputs.T @ (truth - colors)).T

@@ -104,8 +104,8 @@ def refine_capture(screws: Screws, capture: Capture, depth: float) -> Capture:
             )
     moves[capture.train] = deviation
     inputs = in_default_precision((moves, capture.cameras))
-    refined = jax.jit(_move, static_argnums=2)(*inputs, depth)
-    cameras = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), refined)
+    refined_cameras = jax.jit(_move, static_argnums=2)(*inputs, depth)
+    cameras = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), refined_cameras)
     return dataclasses.replace(capture, cameras=cameras)
 
 

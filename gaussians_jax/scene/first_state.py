@@ -37,10 +37,10 @@ def estimate_memory_bytes(spec: SplatScene, capture: Capture) -> int:
     Returns:
       Memory in bytes.
     """
-    tracked = spec.start.motion == "tracks"
-    init = initialization.of_start(spec.init, tracked)
+    uses_tracks = spec.start.motion == "tracks"
+    init = initialization.of_start(spec.init, uses_tracks)
     count = initialization.initial_count(init, capture)
-    count += spec.start.moving_points if tracked else 0
+    count += spec.start.moving_points if uses_tracks else 0
     count *= 1 + (carried_count(spec) or 0)
     harmonics = 3 * (spec.sh_degree + 1) ** 2
     # Parameters, two moments, gradient, update, and the tables of one projection.
@@ -78,20 +78,22 @@ def first_state(
     refuse_what_cannot_train(spec)
     start_key, run_key = jax.random.split(key)
     seed = int(jax.random.randint(start_key, (), 0, np.iinfo(np.int32).max))
-    tracked, hidden, capture = _from_tracks(spec, effects, capture, start_key)
+    seeds, occluded_points, capture = _from_tracks(spec, effects, capture, start_key)
     most = None if strategy is None else strategy.cap_max
-    init = initialization.of_start(spec.init, tracked is not None, most)
+    init = initialization.of_start(spec.init, seeds is not None, most)
     position, color = initialization.initial_points(init, capture, seed)
-    if hidden is not None and most is not None:
-        hidden = _thin(hidden, most - len(position) - len(tracked.position))
+    if occluded_points is not None and most is not None:
+        occluded_points = _thin(
+            occluded_points, most - len(position) - len(seeds.position)
+        )
     hidden_rows = slice(len(position), len(position))
-    if hidden is not None:
-        position = np.concatenate([position, hidden.position])
-        color = np.concatenate([color, hidden.color / 255])
+    if occluded_points is not None:
+        position = np.concatenate([position, occluded_points.position])
+        color = np.concatenate([color, occluded_points.color / 255])
         hidden_rows = slice(hidden_rows.start, len(position))
-    if tracked is not None:
-        position = np.concatenate([position, tracked.position])
-        color = np.concatenate([color, tracked.color])
+    if seeds is not None:
+        position = np.concatenate([position, seeds.position])
+        color = np.concatenate([color, seeds.color])
     rows = splats.from_points(
         position,
         color,
@@ -104,15 +106,15 @@ def first_state(
     opaque = np.array(rows.opacity_logit)
     opaque[hidden_rows] = HIDDEN_LOGIT
     rows = rows._replace(opacity_logit=jax.device_put(opaque))
-    if tracked is not None:
-        rows = track_start.flattened(rows, tracked.position, spec.start.thickness)
+    if seeds is not None:
+        rows = track_start.flattened(rows, seeds.position, spec.start.thickness)
     rows = jax.tree.map(np.asarray, rows)
     rows = initialization.clamp_scales(rows, capture, spec.init.max_scale)
     count = len(position)
     params = Params({"splats": jax.device_put(rows)}, {})
     params = components.initialized(effects, start_key, params)
-    if tracked is not None:
-        params = track_start.put_in(params, effects, tracked)
+    if seeds is not None:
+        params = track_start.put_in(params, effects, seeds)
     params = params._replace(rows=jax.tree.map(np.asarray, params.rows))
     params = splats.pad_rows(params, splats.capacity_for(count, most))
     params = in_default_precision(params)
@@ -134,11 +136,11 @@ def _from_tracks(spec, effects, capture, key):
     seeds = track_start.start(spec.start, effects[0], tracking, capture, key)
     if len(tracking.static_cloud.position) > initialization.point_count(capture):
         capture = dataclasses.replace(capture, points=tracking.static_cloud)
-    hidden = None
+    occluded_points = None
     if spec.start.fill_hidden and initialization.point_count(capture):
         views = view_set.in_time_order(record.downscale(capture, tracking.factor))
-        hidden = hidden_points.behind(views, capture.points, tracking.moving)
-    return seeds, hidden, capture
+        occluded_points = hidden_points.behind(views, capture.points, tracking.moving)
+    return seeds, occluded_points, capture
 
 
 def _thin(points, most):

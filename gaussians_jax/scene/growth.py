@@ -100,14 +100,14 @@ def _event(event, strategy, metadata, effects, optimizer):
             optimizer,
             frames,
         )
-        changed = event.apply(population)
-        stats = changed.state
+        new_population = event.apply(population)
+        stats = new_population.state
         if event.changes_rows:
-            stats = strategy.init(changed.params.rows["splats"])
-            states = states_of(effects, changed.params)
+            stats = strategy.init(new_population.params.rows["splats"])
+            states = states_of(effects, new_population.params)
         return state._replace(
-            params=changed.params,
-            optimizer=changed.moments,
+            params=new_population.params,
+            optimizer=new_population.moments,
             aux_state=AuxState(stats, states),
         )
 
@@ -117,8 +117,8 @@ def _event(event, strategy, metadata, effects, optimizer):
 def _revision(effect, steps):
     def revise(state, frames):
         del frames
-        projected = effect.revise(state.params.nets[effect.name], int(state.step))
-        nets = state.params.nets | {effect.name: projected}
+        new_net = effect.revise(state.params.nets[effect.name], int(state.step))
+        nets = state.params.nets | {effect.name: new_net}
         return state._replace(params=state.params._replace(nets=nets))
 
     when = tuple(step for step in effect.revise_at if step < steps)

@@ -90,12 +90,12 @@ def fit_code(
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, best)
         damping = damping * jnp.where(better, LOWER, RAISE)
         # Without a first image there is nothing to improve.
-        done = (better & little) | (damping > STUCK) | ~jnp.isfinite(best.cost)
-        return best, damping, passes + 1, done
+        is_done = (better & little) | (damping > STUCK) | ~jnp.isfinite(best.cost)
+        return best, damping, passes + 1, is_done
 
-    def unfinished(loop_state):
-        _, _, passes, done = loop_state
-        return (passes < PASSES) & ~done
+    def should_continue(loop_state):
+        _, _, passes, is_done = loop_state
+        return (passes < PASSES) & ~is_done
 
     # One evaluation in the program: the first step, from an infinite cost, is to
     # `start` itself.
@@ -108,7 +108,7 @@ def fit_code(
     )
     damping = jnp.asarray(DAMPING / LOWER, start.dtype)
     begin = unknown, damping, jnp.int32(0), jnp.asarray(False)
-    best, *_ = jax.lax.while_loop(unfinished, step, begin)
+    best, *_ = jax.lax.while_loop(should_continue, step, begin)
     return best.code, best.image
 
 
@@ -133,8 +133,8 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer:
 
     def at(params, view, step):
         """Return a function from a code to an image and its Jacobian."""
-        prepared = stages.prepare(params)
-        gaussians = stages.deform(params, prepared, view.time)
+        cache = stages.prepare(params)
+        gaussians = stages.deform(params, cache, view.time)
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
         rows = splats.active_harmonics(stages.rows(params), degree)
         camera = view.camera
@@ -143,11 +143,18 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer:
 
         def image_and_jacobian(code):
             paint = _painter(appearance, params, colors, direction, metadata)
-            changed, behind = paint(code)
+            new_colors, behind = paint(code)
             of_gaussians, of_sky = jax.jacfwd(paint)(code)
-            features = of_gaussians.reshape(len(changed), -1)
+            features = of_gaussians.reshape(len(new_colors), -1)
             frame = rendering.render(
-                gaussians, changed, camera, size, raster, behind, features, depth=False
+                gaussians,
+                new_colors,
+                camera,
+                size,
+                raster,
+                behind,
+                features,
+                depth=False,
             )
             transmittance = 1 - frame.rendering.alpha
             jacobian = frame.features.reshape(*transmittance.shape, 3, -1)
@@ -167,9 +174,9 @@ def scorer(spec, metadata, size: tuple[int, int]) -> HalfScorer:
         def fit_image(view: View, left: np.ndarray, valid: np.ndarray | None):
             # The renderer's images are whole, so the right half is not to be fitted.
             right = ((0, 0), (0, size[0] - left.shape[1]))
-            observed = np.ones(left.shape[:2], bool) if valid is None else valid
+            is_observed = np.ones(left.shape[:2], bool) if valid is None else valid
             truth = np.pad(left.astype(np.float32) / 255, (*right, (0, 0)))
-            inputs = in_default_precision((truth, np.pad(observed, right)))
+            inputs = in_default_precision((truth, np.pad(is_observed, right)))
             return solve(state.params, view, *inputs, state.step)
 
         # The fitted image is rendered already.

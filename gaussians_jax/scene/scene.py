@@ -146,8 +146,8 @@ def _model(spec, metadata, effects):
     devices = data_parallel.device_count(spec.batch_size, divisible=True)
 
     def whole_frame(params, view, size, step):
-        deformed = stages.deform(params, stages.prepare(params), view.time)
-        return stages.draw(params, deformed, view, size, step)
+        gaussians = stages.deform(params, stages.prepare(params), view.time)
+        return stages.draw(params, gaussians, view, size, step)
 
     def init(capture, key, spec=spec):
         strategy = strategy_of(spec, metadata)
@@ -193,18 +193,18 @@ def _stages(spec, metadata, effects):
     def prepare(params):
         return deformation.prepare(effects, params)
 
-    def deform(params, prepared, time):
-        return deformation.deform(effects, params, prepared, time)
+    def deform(params, cache, time):
+        return deformation.deform(effects, params, cache, time)
 
     def rows(params):
         return deformation.rendered_rows(effects, params)
 
-    def draw(params, deformed, view, size, step):
+    def draw(params, gaussians, view, size, step):
         degree = splats.active_degree(step, spec.sh_every, spec.sh_degree)
-        rendered = drawing.draw(
-            spec, metadata, effects, params, rows(params), deformed, view, size, degree
+        frame = drawing.draw(
+            spec, metadata, effects, params, rows(params), gaussians, view, size, degree
         )
-        return drawing.exposed(effects, params, rendered.rendering, view)
+        return drawing.exposed(effects, params, frame.rendering, view)
 
     return Stages(prepare, deform, draw, rows)
 
@@ -233,20 +233,20 @@ def _stepper(spec, metadata, effects, optimizer, devices):
             each = [one_view(0, state, frames)]
             means = each[0][:2]
         else:
-            stacked = data_parallel.on_devices(
+            per_view = data_parallel.on_devices(
                 one_view, spec.batch_size, devices, state, frames
             )
-            means = jax.tree.map(lambda leaf: leaf.mean(0), stacked[:2])
+            means = jax.tree.map(lambda leaf: leaf.mean(0), per_view[:2])
             each = [
-                jax.tree.map(lambda leaf, index=index: leaf[index], stacked)
+                jax.tree.map(lambda leaf, index=index: leaf[index], per_view)
                 for index in range(spec.batch_size)
             ]
         metrics, grads = means
-        trained = update.descend(spec, metadata, effects, optimizer, state, grads)
+        new_state = update.descend(spec, metadata, effects, optimizer, state, grads)
         aux_state = state.aux_state
         for _, _, statistics in each:
             aux_state = update.observe(strategy, aux_state, statistics, size)
-        state = TrainState(*trained, aux_state, state.step + 1, state.key)
+        state = TrainState(*new_state, aux_state, state.step + 1, state.key)
         return state, metrics
 
     return step
@@ -281,16 +281,18 @@ def _gradients(spec, metadata, effects, state, frames, row, condition, bands):
     def loss(params, probe):
         canonical = splats.activate(params.rows["splats"])
         gaussians = deform(params, canonical)
-        rows, rendered = deformation.rendered(effects, params, gaussians, condition)
-        posed = _refine_cameras(effects, params, frames)
-        view = _view(posed, row)
+        rows, rendered_gaussians = deformation.rendered(
+            effects, params, gaussians, condition
+        )
+        posed_frames = _refine_cameras(effects, params, frames)
+        view = _view(posed_frames, row)
         frame = drawing.draw(
             spec,
             metadata,
             effects,
             params,
             rows,
-            rendered,
+            rendered_gaussians,
             view,
             size,
             degree,
@@ -298,11 +300,11 @@ def _gradients(spec, metadata, effects, state, frames, row, condition, bands):
             depth=depth,
             devices=bands,
         )
-        exposed = drawing.exposed(effects, params, frame.rendering, view)
-        observation = observe(posed, row, exposed)
+        exposed_rendering = drawing.exposed(effects, params, frame.rendering, view)
+        observation = observe(posed_frames, row, exposed_rendering)
         states = state.aux_state.effects
         value, metrics = loss_of(spec, effects, params, observation, condition, states)
-        weight = deformation.significance(effects, rendered)
+        weight = deformation.significance(effects, rendered_gaussians)
         return value, (metrics, frame.footprints, canonical, gaussians, weight)
 
     probe = deformation.probe(effects, state.params)
@@ -353,12 +355,12 @@ def loss_of(
     assert observation.rendering is not None
     assert condition.step is not None
     assert condition.key is not None
-    color, logged = observation.rendering.color, {}
+    color, extra_metrics = observation.rendering.color, {}
     if spec.transients is not None:
         valid, share = transients.static_pixels(
             spec.transients, color, truth, valid, condition.step
         )
-        logged = {transients.SHARE: share}
+        extra_metrics = {transients.SHARE: share}
     photometric = losses.photometric(
         color, truth, valid, dssim_weight=spec.dssim_weight
     )
@@ -375,7 +377,7 @@ def loss_of(
     if strategy is not None and hasattr(strategy, "loss"):
         for name, term in as_terms(strategy.loss(params, context)).items():
             terms[f"{name_of(strategy)}/{name}"] = term
-    metrics = {"mse": losses.mse(color, truth, valid)} | logged | values(terms)
+    metrics = {"mse": losses.mse(color, truth, valid)} | extra_metrics | values(terms)
     return weighted_sum(terms, photometric), metrics
 
 

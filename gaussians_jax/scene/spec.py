@@ -188,8 +188,8 @@ def raster_of(spec: SplatScene, metadata: SceneMetadata) -> RasterSpec:
     near = spec.raster.near
     if metadata.near < near:
         near = 2.0 ** math.floor(math.log2(metadata.near))
-    distorted = spec.raster.distorted or metadata.distorted
-    return dataclasses.replace(spec.raster, near=near, distorted=distorted)
+    has_distortion = spec.raster.distorted or metadata.distorted
+    return dataclasses.replace(spec.raster, near=near, distorted=has_distortion)
 
 
 def optimizer_of(spec: SplatScene) -> Optimizer:
@@ -307,12 +307,12 @@ def _refuse_beside_children(spec):
         "temporal_opacity": spec.temporal_opacity,
         "motion.fading": _fading(spec.motion),
     }
-    enabled = [name for name, value in settings.items() if value is not None]
-    if has_children and enabled:
+    enabled_names = [name for name, value in settings.items() if value is not None]
+    if has_children and enabled_names:
         raise ValueError(
-            f"{enabled[0]} changes opacities over time, but child Gaussians are "
+            f"{enabled_names[0]} changes opacities over time, but child Gaussians are "
             "rendered with opacities of their own; leave it out "
-            f"({enabled[0]}=none), or {ALONE}"
+            f"({enabled_names[0]}=none), or {ALONE}"
         )
 
 

@@ -52,21 +52,21 @@ def parts(
         canonical = splats.activate(params.rows["splats"])
         return deformation.rendered(effects, params, canonical, condition)
 
-    rendered = render(state.params)
-    per_view = _drawing(spec, metadata, effects, rendered, frames)
+    rows_and_gaussians = render(state.params)
+    per_view = _drawing(spec, metadata, effects, rows_and_gaussians, frames)
     per_view |= _components(effects, state, frames, condition)
-    per_step = _update(spec, metadata, effects, state, rendered, frames)
+    per_step = _update(spec, metadata, effects, state, rows_and_gaussians, frames)
     views = max(spec.batch_size // model.devices, 1)
 
-    def with_rest(timed):
-        timed |= {name: views * timed[name] for name in per_view}
+    def with_rest(times):
+        times |= {name: views * times[name] for name in per_view}
         total = rate.step_ms(model, state, frames, spec.steps)
-        return timed | {"rest": max(total - sum(timed.values()), 0.0)}
+        return times | {"rest": max(total - sum(times.values()), 0.0)}
 
     return StepParts(per_view | per_step, with_rest)
 
 
-def _drawing(spec, metadata, effects, rendered, frames):
+def _drawing(spec, metadata, effects, rows_and_gaussians, frames):
     """Return the rendering of the current Gaussians, and its loss."""
     observation = scene.observe(frames, 0, None)
     camera = _first_camera(frames)
@@ -88,7 +88,7 @@ def _drawing(spec, metadata, effects, rendered, frames):
             color, observation.truth, observation.valid, dssim_weight=spec.dssim_weight
         )
 
-    rows, gaussians = rendered
+    rows, gaussians = rows_and_gaussians
     coefficients = splats.active_harmonics(rows, spec.sh_degree)
     args = gaussians, coefficients, jnp.zeros_like(gaussians.mean[:, :2])
     return {
@@ -100,15 +100,15 @@ def _drawing(spec, metadata, effects, rendered, frames):
 def _components(effects, state, frames, condition):
     """Return the work of each component that deforms Gaussians or adds to the loss."""
     observation, parts = scene.observe(frames, 0, None), {}
-    rendered = Rendering(
+    frame_rendering = Rendering(
         observation.truth, *(jnp.ones(observation.truth.shape[:2]) for _ in "ad")
     )
     for effect in effects:
         # The step is an input, because a compiled-in warm-up would cost nothing.
         def value(params, rendering, component_state, condition, effect=effect):
-            rendered = observation._replace(rendering=rendering)
+            frame_observation = observation._replace(rendering=rendering)
             return _sum_of_effect(
-                effect, effects, params, rendered, condition, component_state
+                effect, effects, params, frame_observation, condition, component_state
             )
 
         if {effect.deform, effect.derive, effect.penalty} != {None}:
@@ -116,12 +116,12 @@ def _components(effects, state, frames, condition):
             grads = jax.grad(value, (0, 1))
             name = effect.name.replace("_", " ")
             parts[name] = part(
-                grads, state.params, rendered, component_state, condition
+                grads, state.params, frame_rendering, component_state, condition
             )
     return parts
 
 
-def _update(spec, metadata, effects, state, rendered, frames):
+def _update(spec, metadata, effects, state, rows_and_gaussians, frames):
     """Return the optimizer update and the statistics, with stand-in gradients."""
     optimizer = optimizer_of(spec)
 
@@ -141,7 +141,7 @@ def _update(spec, metadata, effects, state, rendered, frames):
             lambda *args: projection.project(
                 *args, _size(frames), raster_of(spec, metadata)
             ),
-            rendered[1],
+            rows_and_gaussians[1],
             _first_camera(frames),
         )
         # The time does not depend on the values.
@@ -173,8 +173,10 @@ def _sum_of_effect(effect, effects, params, observation, condition, state):
         total += sum(jnp.sum(leaf) for leaf in at_frame)
     if effect.derive is not None:
         canonical = splats.activate(params.rows["splats"])
-        rows, rendered = deformation.rendered((effect,), params, canonical, condition)
-        total += sum(jnp.sum(leaf) for leaf in (*rows, *rendered))
+        rows, rendered_gaussians = deformation.rendered(
+            (effect,), params, canonical, condition
+        )
+        total += sum(jnp.sum(leaf) for leaf in (*rows, *rendered_gaussians))
     context = PenaltyContext(
         condition=condition,
         step=condition.step,

@@ -138,10 +138,10 @@ def fit_tracks(
             f"times must be {count} increasing numbers, one for each column of tracks, "
             f"got {times}"
         )
-    observed = position[valid]
-    unit = float(np.sqrt(np.mean(np.sum((observed - observed.mean(0)) ** 2, axis=-1))))
+    points = position[valid]
+    unit = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, axis=-1))))
     unit = max(unit, float(np.finfo(np.float32).tiny) ** 0.5)
-    box = tuple(observed.min(0) - unit), tuple(observed.max(0) + unit)
+    box = tuple(points.min(0) - unit), tuple(points.max(0) + unit)
     metadata = SceneMetadata(unit, (0.0, 0.0, 0.0), count, box=box)
     motion = components.moving_at_once(motion)
     effect = components.motion_of_capture(motion, steps, metadata)

@@ -54,18 +54,18 @@ def descend(
     """
     updates, opt_state = optimizer.update(grads, state.optimizer, state.params)
     by_part = _learning_rates(spec, metadata, effects, state.params, state.step)
-    trained = Trained(apply_updates(state.params, updates, by_part), opt_state)
+    new_state = Trained(apply_updates(state.params, updates, by_part), opt_state)
     perturb = getattr(spec.strategy, "perturb", None)
     if perturb is not None:
         key = growth.stream_key(state, growth.NOISE)
         rate = by_part.rows["splats"].mean
-        params = perturb(key, trained.params, rate)
-        trained = trained._replace(params=params)
+        params = perturb(key, new_state.params, rate)
+        new_state = new_state._replace(params=params)
     if spec.alternation is not None:
         mask = phases.update_mask(spec.alternation, state.step)
         before = Trained(state.params, state.optimizer)
-        trained = phases.freeze(optimizer, mask, before, trained)
-    return trained
+        new_state = phases.freeze(optimizer, mask, before, new_state)
+    return new_state
 
 
 def observe(

@@ -72,11 +72,11 @@ def reduced(spec, metadata, without: tuple[str, ...]):
       ValueError: If the scene cannot be rendered without one of them.
     """
     check_there(without, parts(spec, metadata).removable)
-    replaced: dict[str, Any] = {name: None for name in REMOVABLE if name in without}
-    if "motion" in replaced and isinstance(spec.motion, AnchorMotionSpec):
+    changes: dict[str, Any] = {name: None for name in REMOVABLE if name in without}
+    if "motion" in changes and isinstance(spec.motion, AnchorMotionSpec):
         # Static children of anchors are computed from the same features as the motion.
-        replaced["motion"] = dataclasses.replace(spec.motion, moves=False)
-    return dataclasses.replace(spec, **replaced)
+        changes["motion"] = dataclasses.replace(spec.motion, moves=False)
+    return dataclasses.replace(spec, **changes)
 
 
 class Faster(NamedTuple):
@@ -126,7 +126,7 @@ def from_knots(
         table,
         Stages(
             prepare=lambda inputs: (),
-            deform=lambda inputs, prepared, time: time_knots.at(
+            deform=lambda inputs, cache, time: time_knots.at(
                 inputs[1], time, interpolation
             ),
             draw=lambda inputs, *others: stages.draw(inputs[0], *others),
@@ -159,9 +159,9 @@ def without_static(model: Model, state: TrainState, static_threshold: float) -> 
     times = np.linspace(0, 1, INSTANTS)
     parts = static_rows.split(state.params, deform_rows, times, static_threshold)
 
-    def deform(inputs, prepared, time):
+    def deform(inputs, cache, time):
         return static_rows.deform(
-            inputs[1], lambda rows, time: stages.deform(rows, prepared, time), time
+            inputs[1], lambda rows, time: stages.deform(rows, cache, time), time
         )
 
     return _with(
@@ -244,8 +244,8 @@ def _with(model: Model, state: TrainState, extras: Any, stages: Stages, summary:
     """Return the model on `(params, extras)`. Extras are inputs, not constants."""
 
     def render(inputs, view, size, step):
-        deformed = stages.deform(inputs, stages.prepare(inputs), view.time)
-        return stages.draw(inputs, deformed, view, size, step)
+        gaussians = stages.deform(inputs, stages.prepare(inputs), view.time)
+        return stages.draw(inputs, gaussians, view, size, step)
 
     return Faster(
         model._replace(render=render, stages=stages),
