@@ -149,7 +149,7 @@ def measure(case: Case, test: str, numbers: int, repeats: int) -> CaseResult:
     """Measure the errors in every precision, and the cost of the stable form."""
     outcomes = {}
     for dtype, bounds in case.bounds.items():
-        inputs = hard_case.rounded(case.inputs, dtype)
+        inputs = hard_case.round_to(case.inputs, dtype)
         exact = [hard_case.truth(case, inputs, order) for order in range(len(bounds))]
         errors = {}
         for form in Outcome._fields:

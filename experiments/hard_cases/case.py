@@ -155,12 +155,12 @@ def _mixed_difference(at, i, j, sign):
     return at((i, sign), (j, 1)) - at((i, sign), (j, -1))
 
 
-def rounded(inputs: np.ndarray, dtype: str) -> np.ndarray:
+def round_to(inputs: np.ndarray, dtype: str) -> np.ndarray:
     """Round inputs to a precision, and return them as float64."""
     return np.asarray(inputs).astype(jnp.dtype(dtype)).astype(np.float64)
 
 
-def errors(case: Case, got: np.ndarray, exact: np.ndarray, order: int) -> np.ndarray:
+def errors(case: Case, actual: np.ndarray, exact: np.ndarray, order: int) -> np.ndarray:
     """Compute the largest error over the largest exact entry of each point.
 
     It is infinite where a value is not finite. `case.floors[order]` bounds the divisor
@@ -169,7 +169,7 @@ def errors(case: Case, got: np.ndarray, exact: np.ndarray, order: int) -> np.nda
     axes = tuple(range(1, exact.ndim))
     size = np.maximum(np.abs(exact).max(axis=axes), case.floors[order])
     with np.errstate(invalid="ignore", over="ignore"):
-        off = np.abs(np.asarray(got, np.float64) - exact).max(axis=axes)
+        off = np.abs(np.asarray(actual, np.float64) - exact).max(axis=axes)
     off = np.where(np.isfinite(off), off, np.inf)
     # A truth of exactly zero without a floor is met exactly or not at all.
     relative = off / np.where(size > 0, size, 1)
@@ -197,13 +197,13 @@ def evaluate(
     """
     rows = np.asarray(inputs).astype(jnp.dtype(dtype))
     # Cases of one function share a program: as many rows, the last one repeated.
-    more = -len(rows) % ROWS
-    padded = np.concatenate([rows, np.repeat(rows[-1:], more, axis=0)])
-    results = _program(function, count, options)(padded)
-    return tuple(np.asarray(one)[: len(rows)] for one in results)
+    padding = -len(rows) % ROWS
+    padded_rows = np.concatenate([rows, np.repeat(rows[-1:], padding, axis=0)])
+    results = _program(function, count, options)(padded_rows)
+    return tuple(np.asarray(result)[: len(rows)] for result in results)
 
 
 @functools.cache
 def _program(function, count, options):
-    batched = jax.vmap(derivatives(function, count))
-    return jax.jit(batched, compiler_options=dict(options))
+    batch_derivatives = jax.vmap(derivatives(function, count))
+    return jax.jit(batch_derivatives, compiler_options=dict(options))

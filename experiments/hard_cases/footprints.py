@@ -115,8 +115,8 @@ NEEDLE = Case(
 
 def _antialiased_textbook(x):
     flat = _covariance(x)
-    dilated = flat + SHARP.eps2d * jnp.eye(2, dtype=x.dtype)
-    ratio = jnp.linalg.det(flat) / jnp.linalg.det(dilated)
+    dilated_covariance = flat + SHARP.eps2d * jnp.eye(2, dtype=x.dtype)
+    ratio = jnp.linalg.det(flat) / jnp.linalg.det(dilated_covariance)
     return 0.5 * jnp.sqrt(jnp.maximum(ratio, projection.MIN_COMPENSATION_SQ))[None]
 
 

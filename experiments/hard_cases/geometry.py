@@ -104,30 +104,30 @@ NEAR_PLANE = Case(
 BARREL = -0.5  # k1; folds at a slope of √(2/3), distorted to 0.5443
 
 
-def _undistort(distorted):
+def _undistort(distorted_slopes):
     lens = (
-        constant([BARREL, 0, 0], distorted.dtype),
-        constant(np.zeros(2), distorted.dtype),
+        constant([BARREL, 0, 0], distorted_slopes.dtype),
+        constant(np.zeros(2), distorted_slopes.dtype),
     )
-    return distortion.undistort(*lens, distorted)[0]
+    return distortion.undistort(*lens, distorted_slopes)[0]
 
 
-def _fixed_point(distorted):
+def _fixed_point(distorted_slopes):
     """Ten steps as in OpenCV."""
-    slopes = distorted
+    slopes = distorted_slopes
     for _ in range(10):
-        slopes = distorted / (1 + BARREL * jnp.sum(slopes**2))
+        slopes = distorted_slopes / (1 + BARREL * jnp.sum(slopes**2))
     return slopes
 
 
-def _exact_undistorted(distorted):
+def _exact_undistorted(distorted_slopes):
     """The middle root of r³ - 2 r + 2 t = 0, by Viète's cosines."""
-    target = mpmath.sqrt(distorted[0] ** 2 + distorted[1] ** 2)
+    target = mpmath.sqrt(distorted_slopes[0] ** 2 + distorted_slopes[1] ** 2)
     if target == 0:
         return [mpmath.mpf(0)] * 2
     third = mpmath.acos(-target * mpmath.sqrt(mpmath.mpf(27) / 8)) / 3
     radius = mpmath.sqrt(mpmath.mpf(8) / 3) * mpmath.cos(third - 2 * mpmath.pi / 3)
-    return [radius / target * x for x in distorted]
+    return [radius / target * x for x in distorted_slopes]
 
 
 _BENT = np.array([0, 1e-20, 1e-6, 0.1, 0.3, 0.5, 0.54, 0.544])

@@ -58,8 +58,8 @@ def _visible(x):
 
 
 def _exact_visible(x):
-    clamped = max(min(x[1], mpmath.mpf(_HIGH)), mpmath.mpf(_LOW))
-    return [mpmath.exp(-((x[0] * mpmath.exp(-clamped)) ** 2))]
+    clamped_log_width = max(min(x[1], mpmath.mpf(_HIGH)), mpmath.mpf(_LOW))
+    return [mpmath.exp(-((x[0] * mpmath.exp(-clamped_log_width)) ** 2))]
 
 
 VISIBLE = Case(
@@ -113,8 +113,10 @@ def _quotients(x):
 def _exact_shares(x):
     scores = []
     for place, slant in zip(_ROW, _SLANT, strict=True):
-        clamped = max(x[1] + mpmath.mpf(slant), mpmath.mpf(-20))
-        scores.append(-(((x[0] + mpmath.mpf(place)) * mpmath.exp(-clamped)) ** 2) / 2)
+        clamped_log_radius = max(x[1] + mpmath.mpf(slant), mpmath.mpf(-20))
+        scores.append(
+            -(((x[0] + mpmath.mpf(place)) * mpmath.exp(-clamped_log_radius)) ** 2) / 2
+        )
     shares = [mpmath.exp(one - max(scores)) for one in scores]
     return [one / mpmath.fsum(shares) for one in shares]
 

@@ -39,10 +39,10 @@ def _exact_edge(x, first=0):
     low, high, sigma = first, first + KERNELS - 1, mpmath.sqrt(mpmath.mpf(0.5))
     excess = max(low - x, x - high, 0) / sigma
     beyond = sigma * (1 - 1 / mpmath.sqrt(1 + 2 * excess + 3 * excess**2))
-    clamped = low - beyond if x < low else high + beyond if x > high else x
+    clamped_x = low - beyond if x < low else high + beyond if x > high else x
     return [
         mpmath.fsum(
-            mpmath.mpf(w) * mpmath.exp(-((clamped - first - g) ** 2))
+            mpmath.mpf(w) * mpmath.exp(-((clamped_x - first - g) ** 2))
             for g, w in enumerate(WEIGHTS)
         )
     ]
@@ -96,7 +96,7 @@ FAR_AWAY = Case(
 CHOSEN = 3  # the one kernel of the next case, at x = 3
 
 
-def _trained(x):
+def _trained_kernel(x):
     """One kernel of a trained width e^s, with inputs x and s."""
     shape = KERNELS, 1
     center = jnp.arange(KERNELS, dtype=x.dtype)[:, None]
@@ -132,7 +132,7 @@ WIDTH = Case(
     axis="s, the width's logarithm",
     at=_WIDTHS[:, 1],
     points=_WIDTHS,
-    stable=_trained,
+    stable=_trained_kernel,
     textbook=_by_variance,
     exact=_exact_trained,
     bounds={
@@ -163,9 +163,11 @@ def _by_moments(x):
 def _exact_standardized(x):
     features = [64 + x[0] * mpmath.mpf(p) for p in _PATTERN]
     mean = mpmath.fsum(features) / len(features)
-    centered = [f - mean for f in features]
-    variance = mpmath.fsum(c**2 for c in centered) / len(features)
-    return [c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in centered]
+    deviations = [f - mean for f in features]
+    variance = mpmath.fsum(c**2 for c in deviations) / len(features)
+    return [
+        c / mpmath.sqrt(variance + mpmath.mpf(kan.NORM_VARIANCE)) for c in deviations
+    ]
 
 
 # Powers of two, so that what is standardized is exact in float32.

@@ -46,20 +46,20 @@ def costs(row) -> str:
 
 def summary(rows) -> str:
     """Summarize the table in two sentences."""
-    broken = sum(
+    broken_count = sum(
         any(np.max(x) > 1e-2 for o in row.outcomes.values() for x in o.textbook)
         for row in rows
     )
     verdict = (
-        f"{broken} of {len(rows)} textbook forms are wrong by more than one per cent "
-        f"somewhere, in value or derivative."
+        f"{broken_count} of {len(rows)} textbook forms are wrong by more than one per "
+        f"cent somewhere, in value or derivative."
     )
-    timed = [row for row in rows if row.case.alike]
-    if not timed:
+    timed_rows = [row for row in rows if row.case.alike]
+    if not timed_rows:
         return verdict
-    value = np.median([row.value_cost for row in timed])
-    gradient = np.median([row.gradient_cost for row in timed])
-    costly = max(timed, key=lambda row: row.gradient_cost)
+    value = np.median([row.value_cost for row in timed_rows])
+    gradient = np.median([row.gradient_cost for row in timed_rows])
+    costly = max(timed_rows, key=lambda row: row.gradient_cost)
     return (
         f"{verdict}\nMedian time of ours over the textbook's: value {value:.2f}, "
         f"gradient {gradient:.2f}; most expensive gradient {costly.gradient_cost:.2f} "
@@ -140,8 +140,8 @@ def save_numbers(folder, rows, args) -> None:
                 metrics.append(
                     Metric(f"{stem}.textbook", float(np.max(theirs)), "", "lower")
                 )
-        measured = {"value": row.value_cost, "gradient": row.gradient_cost}
-        for name, cost in measured.items() if row.case.alike else ():
+        cost_ratios = {"value": row.value_cost, "gradient": row.gradient_cost}
+        for name, cost in cost_ratios.items() if row.case.alike else ():
             metrics.append(Metric(f"{key}.{name}_cost", cost, "", "lower", 0.25))
     about = {"numbers": args.numbers, "repeats": args.repeats, **clock.machine()}
     clock.write_metrics(folder / "hard_cases.json", metrics, about)

@@ -24,10 +24,10 @@ def _rodrigues(w):
     sine = jnp.sin(angle) / angle
     versine = (1 - jnp.cos(angle)) / angle**2
     quotient = (angle - jnp.sin(angle)) / angle**3
-    rotated = point + sine * jnp.cross(w, point)
-    rotated = rotated + versine * jnp.cross(w, jnp.cross(w, point))
+    rotated_point = point + sine * jnp.cross(w, point)
+    rotated_point = rotated_point + versine * jnp.cross(w, jnp.cross(w, point))
     result = linear + versine * jnp.cross(w, linear)
-    return rotated + result + quotient * jnp.cross(w, jnp.cross(w, linear))
+    return rotated_point + result + quotient * jnp.cross(w, jnp.cross(w, linear))
 
 
 def _exact_screw(w):
@@ -39,8 +39,8 @@ def _exact_screw(w):
         return list(x + v)
     one = (1 - mpmath.cos(angle)) / angle**2
     two = (angle - mpmath.sin(angle)) / angle**3
-    rotated = x + mpmath.sin(angle) / angle * (hat * x) + one * (hat * (hat * x))
-    return list(rotated + v + one * (hat * v) + two * (hat * (hat * v)))
+    rotated_point = x + mpmath.sin(angle) / angle * (hat * x) + one * (hat * (hat * x))
+    return list(rotated_point + v + one * (hat * v) + two * (hat * (hat * v)))
 
 
 _EDGE = SERIES_BELOW**0.5
@@ -64,14 +64,14 @@ SCREW = Case(
 )
 
 
-def _exact_stumpff(order, squared):
+def _exact_stumpff(order, angle_sq):
     """Sum the series of c_k to any number of digits, for up to about ten rad."""
     total, n = mpmath.mpf(0), 0
     term = 1 / mpmath.factorial(order)
     while abs(term) > mpmath.eps**2 or n < 4:
         total += term
         n += 1
-        term *= -squared / ((2 * n + order - 1) * (2 * n + order))
+        term *= -angle_sq / ((2 * n + order - 1) * (2 * n + order))
     return total
 
 
@@ -89,8 +89,8 @@ def _column(values):
 
 def _exact_displacement(w, v, x):
     w, v = mpmath.matrix(w), mpmath.matrix(v)
-    hat, squared = _hat(w), _square(w)
-    one, two, three = (_exact_stumpff(k, squared) for k in (1, 2, 3))
+    hat, angle_sq = _hat(w), _square(w)
+    one, two, three = (_exact_stumpff(k, angle_sq) for k in (1, 2, 3))
     shift = one * (hat * x) + two * (hat * (hat * x))
     return list(shift + v + two * (hat * v) + three * (hat * (hat * v)))
 
@@ -114,7 +114,7 @@ def _of_screw(form):
     )
 
 
-_displaced = _of_screw(lie.displacement)
+_displacement = _of_screw(lie.displacement)
 _displaced_textbook = _of_screw(_textbook_displacement)
 
 
@@ -137,7 +137,7 @@ TURN = Case(
     axis="θ / rad",
     at=_TURNS,
     points=_screws(_TURNS, 0.0),
-    stable=_displaced,
+    stable=_displacement,
     textbook=_displaced_textbook,
     exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 3e-15)},
@@ -152,7 +152,7 @@ SHIFT = Case(
     axis="speed / scene units",
     at=_SPEEDS,
     points=_screws(1e-4, _SPEEDS),
-    stable=_displaced,
+    stable=_displacement,
     textbook=_displaced_textbook,
     exact=_exact_displaced,
     bounds={"float32": (1e-6, 1e-6, 1e-6), "float64": (2e-15, 2e-15, 2e-15)},
@@ -173,8 +173,8 @@ def _textbook_inverse_jacobian(w):
 
 def _exact_inverse_jacobian(w):
     w, v = mpmath.matrix(w), _column(LINEAR)
-    hat, squared = _hat(w), _square(w)
-    two, three, four = (_exact_stumpff(k, squared) for k in (2, 3, 4))
+    hat, angle_sq = _hat(w), _square(w)
+    two, three, four = (_exact_stumpff(k, angle_sq) for k in (2, 3, 4))
     quotient = (three - 2 * four) / (2 * two)
     return list(v - hat * v / 2 + quotient * (hat * (hat * v)))
 
@@ -232,8 +232,8 @@ def _textbook_coupling(w):
 
 def _exact_coupling(w):
     w = mpmath.matrix(w)
-    squared = _square(w)
-    three, four, five = (_exact_stumpff(k, squared) for k in (3, 4, 5))
+    angle_sq = _square(w)
+    three, four, five = (_exact_stumpff(k, angle_sq) for k in (3, 4, 5))
     factors = 1, three, four, (four - 3 * five) / 2
     terms = _coupling_terms(_hat(w), _hat(_column(LINEAR)))
     total = mpmath.zeros(3)

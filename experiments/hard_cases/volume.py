@@ -223,11 +223,11 @@ def _with_a_floor(weights):
     share = jnp.cumsum(weights / jnp.sum(weights))
     share = jnp.concatenate([jnp.zeros_like(share[:1]), share])
     args = jnp.linspace(0, 1, DRAWN, dtype=weights.dtype)
-    reached = args[:, None] >= share
+    is_reached = args[:, None] >= share
     low, high = (
         (
-            jnp.max(jnp.where(reached, x, x[0]), axis=1),
-            jnp.min(jnp.where(~reached, x, x[-1]), axis=1),
+            jnp.max(jnp.where(is_reached, x, x[0]), axis=1),
+            jnp.min(jnp.where(~is_reached, x, x[-1]), axis=1),
         )
         for x in (share, edges)
     )

@@ -39,7 +39,7 @@ def by_case(cases: tuple[Case, ...], slow: tuple[str, ...] = ()):
 @functools.cache
 def _exact(case_key, order, dtype):
     case = case_key.case
-    return hard_case.truth(case, hard_case.rounded(case.inputs, dtype), order)
+    return hard_case.truth(case, hard_case.round_to(case.inputs, dtype), order)
 
 
 class _Key:
