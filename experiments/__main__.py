@@ -69,10 +69,10 @@ def _main(arguments):
     _run(words, by_name, "command", [*for_users, STUDY])
 
 
-def _run(words, names, kind, listed):
+def _run(words, names, kind, offered_names):
     name, *arguments = words
     if name not in names:
-        console.error(f"no {kind} {name!r}; {known_names(name, listed)}")
+        console.error(f"no {kind} {name!r}; {known_names(name, offered_names)}")
         raise SystemExit(2)
     main_of(name)(arguments)
 
@@ -118,7 +118,7 @@ def print_completion(words: list[str]) -> None:
     """
     kinds = {
         name: Annotated[
-            options.offered(main_of(name).settings), tyro.conf.subcommand(name)
+            options.completion_type(main_of(name).settings), tyro.conf.subcommand(name)
         ]
         for name in commands()
     }

@@ -214,7 +214,7 @@ class Ended(NamedTuple):
 
 
 def command(
-    settings: Any, completed: Callable[[list[str]], list[str]] = list
+    settings: Any, complete: Callable[[list[str]], list[str]] = list
 ) -> Callable[[Callable], options.Command]:
     """Make `main(arguments)` of a function of settings that returns the result as JSON.
 
@@ -225,7 +225,7 @@ def command(
 
     Args:
       settings: Dataclass of options.
-      completed: Function that adds words which users may omit to the command line.
+      complete: Function that adds words which users may omit to the command line.
 
     Returns:
       A decorator.
@@ -242,7 +242,7 @@ def command(
             as_json = options.JSON in words
             words = [word for word in words if word != options.JSON]
             with user_errors():
-                args = parse(settings, completed(words), _command_name(run))
+                args = parse(settings, complete(words), _command_name(run))
             aside = _words_aside() if as_json else contextlib.nullcontext()
             with aside, user_errors((MissingExtra,)):
                 result = _interruptible(run, args)
@@ -382,7 +382,7 @@ def check_max_side(max_side: int | None) -> None:
         raise ValueError(f"--max-side {max_side}: draw at least one pixel")
 
 
-def sized(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
+def scale_size(size: tuple[int, int], max_side: int | None) -> tuple[int, int]:
     """Return a width and height, scaled to a longer side of `max_side` if given."""
     if max_side is None:
         return size

@@ -80,15 +80,15 @@ class Compared(NamedTuple):
 def main(args):
     """Run the command. Wrong input ends it with exit code 2."""
     with cli.user_errors():
-        compared = read(args.runs, args.trust if args.frames else None)
+        run_list = read(args.runs, args.trust if args.frames else None)
         folder = run_folder.new_run_folder(args.out, "compare")
-        goals = args.psnr or _default_goals(compared)
-    console.say(table(compared, goals))
-    for line in (*_legend(compared), *remarks(compared)):
+        goals = args.psnr or _default_goals(run_list)
+    console.say(table(run_list, goals))
+    for line in (*_legend(run_list), *remarks(run_list)):
         console.say(line)
-    save(folder, compared, goals)
+    save(folder, run_list, goals)
     if args.frames:
-        kinds = [representations.of_run(each.folder) for each in compared]
+        kinds = [representations.of_run(each.folder) for each in run_list]
         threads = {kind.resources.threads for kind in kinds if kind is not None}
         with cli.user_errors():
             cli.find_code(args.trust)
@@ -97,18 +97,18 @@ def main(args):
                 "all" if "all" in threads else "one",
                 wide=not args.trust,
             )
-            draw(folder / "frames.png", compared, args.frames, args.trust)
+            draw(folder / "frames.png", run_list, args.frames, args.trust)
     console.say(f"saved in {folder}")
     return cli.stored(folder / "compare.json")
 
 
-def read(folders, trusted=None) -> list[Compared]:
+def read(folders, trusted_names=None) -> list[Compared]:
     """Read runs of one capture.
 
     Args:
       folders: Run folders.
-      trusted: Names MODULE:NAME of code from other packages that may be loaded, if the
-        runs are to be rendered.
+      trusted_names: Names MODULE:NAME of code from other packages that may be loaded,
+        if the runs are to be rendered.
 
     Returns:
       The runs.
@@ -118,7 +118,7 @@ def read(folders, trusted=None) -> list[Compared]:
     """
     from nerfies_jax.runs import curves
 
-    compared, sources = [], []
+    run_list, sources = [], []
     for folder, name in zip(folders, _names(folders), strict=True):
         curve = curves.read(folder)
         try:
@@ -129,9 +129,9 @@ def read(folders, trusted=None) -> list[Compared]:
             kind = representations.named(content["representation"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder}: not a run ({error!r})") from error
-        if trusted is not None:
-            trust.check(folder, content, kind.spec_type, trusted)
-        compared.append(Compared(name, folder, metrics, curve, remark))
+        if trusted_names is not None:
+            trust.check(folder, content, kind.spec_type, trusted_names)
+        run_list.append(Compared(name, folder, metrics, curve, remark))
         same = {key: source.get(key) for key in SAME}
         if source.get("capture") is None:  # a built-in scene is made from the seed
             same["seed"] = config.get("seed")
@@ -143,7 +143,7 @@ def read(folders, trusted=None) -> list[Compared]:
                     f"is {sources[-1].get(key)} and {value}; compare runs of one "
                     "capture"
                 )
-    return compared
+    return run_list
 
 
 def _progress(folder, name):
@@ -172,23 +172,23 @@ def _names(folders):
     return names
 
 
-def _default_goals(compared) -> tuple[float, ...]:
+def _default_goals(run_list) -> tuple[float, ...]:
     """Return the final PSNR of all runs except the best, in tenths of a dB."""
-    ends = sorted(run.curve.psnr[-1] for run in compared if run.curve.psnr)
+    ends = sorted(run.curve.psnr[-1] for run in run_list if run.curve.psnr)
     ends = [math.floor(10 * psnr) / 10 for psnr in ends[:-1] if math.isfinite(psnr)]
     return tuple(dict.fromkeys(ends))
 
 
-def times(compared, goals) -> list[list[float | None]]:
+def times(run_list, goals) -> list[list[float | None]]:
     """Return [runs][goals] seconds of training to each PSNR, None where not reached."""
     from nerfies_jax.runs import curves
 
-    return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in compared]
+    return [[curves.seconds_to(run.curve, goal) for goal in goals] for run in run_list]
 
 
-def _columns(compared):
+def _columns(run_list):
     """Return the columns for which any run has a number."""
-    return [c for c in COLUMNS if any(_value(run, c[0]) for run in compared)]
+    return [c for c in COLUMNS if any(_value(run, c[0]) for run in run_list)]
 
 
 def _value(run, key):
@@ -204,14 +204,14 @@ def _is_fitted(run):
     return run.metrics.get("heldout.fitted_psnr") is not None
 
 
-def _legend(compared) -> list[str]:
+def _legend(run_list) -> list[str]:
     """Explain the columns of the table, a line each."""
     from nerfies_jax.metrics.metric_table import METRICS
 
     better = {"higher": " Higher is better.", "lower": " Lower is better.", "equal": ""}
     entries = [
         (head, METRICS["heldout.psnr" if key == UNFITTED else key])
-        for key, head, *_ in _columns(compared)
+        for key, head, *_ in _columns(run_list)
     ]
     return [
         f"  {head}: {entry.explanation}{better[entry.direction]}"
@@ -219,16 +219,16 @@ def _legend(compared) -> list[str]:
     ]
 
 
-def table(compared, goals) -> str:
+def table(run_list, goals) -> str:
     """Format a table with a row for each run."""
-    columns = _columns(compared)
+    columns = _columns(run_list)
     heads = ["run", *(c[1] for c in columns), *(f"s to {goal:g} dB" for goal in goals)]
     lines = [heads]
-    for run, reached in zip(compared, times(compared, goals), strict=True):
+    for run, seconds in zip(run_list, times(run_list, goals), strict=True):
         cells = [
             _cell(_value(run, key), digits, unit) for key, _, digits, unit in columns
         ]
-        cells += ["never" if x is None else f"{x:.0f}" for x in reached]
+        cells += ["never" if x is None else f"{x:.0f}" for x in seconds]
         lines.append([run.name, *cells])
     widths = [max(len(line[i]) for line in lines) for i in range(len(heads))]
     return "\n".join(
@@ -244,26 +244,26 @@ def _cell(value, digits, unit):
     return "-" if value is None else f"{value / unit:,.{digits}f}"
 
 
-def remarks(compared) -> list[str]:
+def remarks(run_list) -> list[str]:
     """Report differences between the runs that affect the table."""
     from nerfies_jax.metrics.metric_table import PROTOCOL
 
-    sentences = [run.remark for run in compared if run.remark]
-    fitted_runs = [run.name for run in compared if _is_fitted(run)]
+    sentences = [run.remark for run in run_list if run.remark]
+    fitted_runs = [run.name for run in run_list if _is_fitted(run)]
     if fitted_runs:
         sentences.append(
             f"PSNR, SSIM and curve of {', '.join(fitted_runs)} follow {PROTOCOL}. "
             "Those of runs without codes of single images are of whole frames."
         )
-    first = compared[0]
-    for run in compared:
-        scored, frames = run.metrics.get("heldout.frames"), len(run.curve.frames)
-        if scored is not None and frames < scored:
+    first = run_list[0]
+    for run in run_list:
+        frame_count, frames = run.metrics.get("heldout.frames"), len(run.curve.frames)
+        if frame_count is not None and frames < frame_count:
             sentences.append(
                 f"The curve of {run.name} and its times to a PSNR are of {frames} "
-                f"held-out frames, its scores in the table of {scored:.0f}."
+                f"held-out frames, its scores in the table of {frame_count:.0f}."
             )
-    for run in compared[1:]:
+    for run in run_list[1:]:
         for key in ("cpu", "cores", "xla_cores", "jax"):
             value, reference = run.curve.machine.get(key), first.curve.machine.get(key)
             if value != reference:
@@ -286,12 +286,12 @@ def remarks(compared) -> list[str]:
     return sentences
 
 
-def save(folder: pathlib.Path, compared, goals) -> None:
+def save(folder: pathlib.Path, run_list, goals) -> None:
     """Write compare.json and curves.png."""
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.visualization import panels
 
-    reached = times(compared, goals)
+    all_seconds = times(run_list, goals)
     write_json(
         folder / "compare.json",
         {
@@ -300,36 +300,36 @@ def save(folder: pathlib.Path, compared, goals) -> None:
                 "seconds_to_psnr": dict(zip(map(str, goals), seconds, strict=True)),
                 "machine": run.curve.machine,
             }
-            for run, seconds in zip(compared, reached, strict=True)
+            for run, seconds in zip(run_list, all_seconds, strict=True)
         },
     )
     histories = {
         run.name: panels.History(run.curve.seconds, run.curve.psnr)
-        for run in compared
+        for run in run_list
         if run.curve.psnr
     }
     if histories:
         panels.curve(histories, folder / "curves.png")
 
 
-def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
+def draw(path: pathlib.Path, run_list, count: int, trusted_names=()) -> None:
     """Draw held-out frames: the truth, the renders of every run and their errors."""
     from nerfies_jax import evaluation, runs
     from nerfies_jax.visualization import panels
 
-    scored = []
-    for each in compared:
-        run = runs.saved_run(each.folder, trusted=trusted)
+    scores = []
+    for each in run_list:
+        run = runs.saved_run(each.folder, trusted=trusted_names)
         state = runs.restore(each.folder, run).state
         run = runs.with_found_cameras(run, state)
         rows = evaluation.spread(run.observed.heldout, count)
         draw = evaluation.Renderer(run.model, run.capture.size)
-        scored.append(evaluation.score(draw, state, run.observed, rows))
+        scores.append(evaluation.score(draw, state, run.observed, rows))
         capture = run.observed
     tiles, captions = [], []
-    for place, row in enumerate(scored[0].rows):
+    for place, row in enumerate(scores[0].rows):
         truth = capture.images[row]
-        renders = [evaluation.to_uint8(each.color[place]) for each in scored]
+        renders = [evaluation.to_uint8(each.color[place]) for each in scores]
         if capture.valid is not None:  # unobserved pixels are no error
             valid = capture.valid[row][..., None]
             truth, renders = truth * valid, [image * valid for image in renders]
@@ -339,10 +339,10 @@ def draw(path: pathlib.Path, compared, count: int, trusted=()) -> None:
         captions += [capture.ids[row]]
         captions += [
             f"{run.name}: {each.psnr[place]:.2f} dB"
-            for run, each in zip(compared, scored, strict=True)
+            for run, each in zip(run_list, scores, strict=True)
         ]
-        captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scored)]
-    sheet = panels.contact_sheet(tiles, captions, columns=1 + len(compared))
+        captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scores)]
+    sheet = panels.contact_sheet(tiles, captions, columns=1 + len(run_list))
     panels.save(sheet, path)
 
 

@@ -36,22 +36,22 @@ def main(args):
     from nerfies_jax.capture import download
 
     if args.name is None:
-        listed = {name: source._asdict() for name, source in download.SOURCES.items()}
+        sources = {name: source._asdict() for name, source in download.SOURCES.items()}
         for name, source in download.SOURCES.items():
             console.say(f"{name:26} {source.paper}, {source.license}")
-        return listed
+        return sources
     with cli.user_errors():
         stem = pathlib.PurePosixPath(args.name).name.removesuffix(".zip")
         folder = args.out or pathlib.Path("captures") / stem
-        loaded = download.download(args.name, folder, args.sha256)
+        report = download.download(args.name, folder, args.sha256)
     console.say(
-        f"{loaded.folder}: {loaded.bytes / 1e6:,.1f} MB, SHA-256 {loaded.sha256}"
+        f"{report.folder}: {report.bytes / 1e6:,.1f} MB, SHA-256 {report.sha256}"
     )
-    for capture in loaded.captures:
+    for capture in report.captures:
         console.say(f"next: nerfies reconstruct {shlex.quote(str(capture))}")
-    if not loaded.captures:
-        console.warn(f"{loaded.folder}: no capture of a format that is read in it")
-    return loaded._asdict()
+    if not report.captures:
+        console.warn(f"{report.folder}: no capture of a format that is read in it")
+    return report._asdict()
 
 
 if __name__ == "__main__":

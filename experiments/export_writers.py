@@ -77,18 +77,18 @@ def _mesh(args: Any, run: Any) -> str:
     cameras = pinholes.pinhole(camera.take(capture.cameras, rows))
     like = evaluation.view_of(capture, int(rows[0]))
     views = evaluation.path_views(cameras, np.full(len(rows), args.time or 0.0), like)
-    extracted = mesh.extract(
+    surface = mesh.extract(
         evaluation.Renderer(run.model, capture.size),
         runs.restore(args.run, run).state,
         views,
         args.voxels or mesh.VOXELS,
     )
-    vertices = units.places_in(args.units or "scene", capture, extracted.vertices)
+    vertices = units.places_in(args.units or "scene", capture, surface.vertices)
     if rotation is not None:
         vertices = vertices @ rotation.T
-    mesh.write(args.place, extracted._replace(vertices=vertices))
+    mesh.write(args.place, surface._replace(vertices=vertices))
     return (
-        f"mesh of {len(vertices)} vertices and {len(extracted.faces)} triangles at "
+        f"mesh of {len(vertices)} vertices and {len(surface.faces)} triangles at "
         f"time {args.time or 0:g}"
     )
 
@@ -103,8 +103,8 @@ def _splatv(args: Any, run: Any) -> str:
     rows = run.model.stages.rows(state.params)
     raster = raster_of(spec, run.metadata)
     visible = _visible_statistics(run, state)
-    learned = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
-    curves = splatv.write(args.place, learned, capture)
+    samples = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
+    curves = splatv.write(args.place, samples, capture)
     model = run.model
     # The file has no exposures and no appearances.
     neutral = tuple(
@@ -113,7 +113,7 @@ def _splatv(args: Any, run: Any) -> str:
     if neutral:
         model = run.representation.products.variant(spec, run.metadata, neutral, False)
     draw = evaluation.Renderer(model, capture.size)
-    fit = splatv.measured(curves, learned, draw, state, raster, capture)
+    fit = splatv.measured(curves, samples, draw, state, raster, capture)
     summary = (
         f"{len(curves.position)} Gaussians on cubics in time, RMS error {fit.rms:.2g} "
         f"scene units ({fit.most:.2g} at the 99th percentile), PSNR to renders of the "
@@ -155,31 +155,31 @@ def _cameras(args: Any, run: Any) -> str:
 def _path(args: Any, run: Any) -> str:
     from nerfies_jax.capture import path_files
 
-    planned = _camera_path(args, run)
+    path = _camera_path(args, run)
     if args.kind == "path":
         path_files.write_nerfstudio(
             args.place,
-            planned,
+            path,
             cli.RATE,
             args.overwrite,
-            path_files.spaced_keyframes(planned),
+            path_files.spaced_keyframes(path),
         )
     else:
-        path_files.write_nerfies(args.place, planned, run.capture, args.overwrite)
-    return f"{len(planned.times)} cameras"
+        path_files.write_nerfies(args.place, path, run.capture, args.overwrite)
+    return f"{len(path.times)} cameras"
 
 
 def _camera_path(args: Any, run: Any) -> Any:
     """Return a path with its times, or with those of `nerfies render`."""
     from nerfies_jax.capture import camera_paths, path_files, pinholes
 
-    planned = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
+    path = path_files.named(args.path or cli.PATHS[0], run.capture, args.frames)
     if not run.representation.scoring.models_lenses(run.metadata):
-        planned = planned._replace(cameras=pinholes.pinhole(planned.cameras))
-    if planned.times is None:
-        count = len(planned.cameras.focal_px)
-        planned = planned._replace(times=camera_paths.times(count))
-    return planned
+        path = path._replace(cameras=pinholes.pinhole(path.cameras))
+    if path.times is None:
+        count = len(path.cameras.focal_px)
+        path = path._replace(times=camera_paths.times(count))
+    return path
 
 
 def _tracks(args: Any, run: Any) -> str:
@@ -216,19 +216,19 @@ def _exr(args: Any, run: Any) -> str:
     from nerfies_jax import evaluation, runs
     from nerfies_jax.evaluation import exr_series
 
-    planned = _camera_path(args, run)
+    path = _camera_path(args, run)
     like = evaluation.view_of(run.capture, int(run.capture.train[0]))
     move = _mover(run)
     exr_series.write(
         args.place,
-        evaluation.Renderer(run.model, planned.size),
+        evaluation.Renderer(run.model, path.size),
         runs.restore(args.run, run).state,
-        evaluation.path_views(planned.cameras, planned.times, like),
+        evaluation.path_views(path.cameras, path.times, like),
         move,
         args.overwrite,
     )
     flow = "without flow, since nothing moves points" if move is None else "and flow"
-    return f"{len(planned.times)} images: color, alpha, depth {flow}"
+    return f"{len(path.times)} images: color, alpha, depth {flow}"
 
 
 WRITERS = {

@@ -58,41 +58,41 @@ def main(args):
         capture = runs.stored_capture(source, args.seed)
         for line in (*describe(capture), "", *gate.table(capture), ""):
             console.say(line)
-        inspected = inspection.inspect(capture, CACHE / "evidence")
-        advice = adviser.advise_all(inspected.findings, args.full, args.seconds)
-        for line in report(inspected, advice, source, args.seconds):
+        inspection_result = inspection.inspect(capture, CACHE / "evidence")
+        advice = adviser.advise_all(inspection_result.findings, args.full, args.seconds)
+        for line in report(inspection_result, advice, source, args.seconds):
             console.say(line)
         path = args.image or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        panels.save(inspected.sheet, path)
+        panels.save(inspection_result.sheet, path)
         console.say(f"contact sheet: {path}")
-        record = _as_json(capture, inspected, advice)
+        record = _as_json(capture, inspection_result, advice)
         if args.findings is not None:
             write_json(args.findings, record)
             console.say(f"findings: {args.findings}")
     return record
 
 
-def report(inspected, advice, source, seconds=None):
+def report(inspection_result, advice, source, seconds=None):
     """Format the table and the commands that follow from it."""
     from nerfies_jax.preprocessing import findings
     from nerfies_jax.runs import commands, prices
     from nerfies_jax.runs.config import RunConfig
 
-    costs = prices.format_prices(inspected.findings)
-    lines = ["", *findings.table(inspected.findings, costs), ""]
+    costs = prices.format_prices(inspection_result.findings)
+    lines = ["", *findings.table(inspection_result.findings, costs), ""]
     lines += [prices.legend(), ""]
     budget = "" if seconds is None else f" --seconds {seconds:g}"
-    for one in advice:
-        lines.append(f"{one.representation}:")
-        config = RunConfig(one.preset, source, overrides=one.overrides)
+    for choice in advice:
+        lines.append(f"{choice.representation}:")
+        config = RunConfig(choice.preset, source, overrides=choice.overrides)
         lines.append(f"  {commands.reconstruct(config)}{budget}")
-        lines += [f"  note: {note}" for note in one.notes]
-    lines.append(f"looked for {inspected.seconds:.0f} s")
+        lines += [f"  note: {note}" for note in choice.notes]
+    lines.append(f"looked for {inspection_result.seconds:.0f} s")
     return lines
 
 
-def _as_json(capture, inspected, advice):
+def _as_json(capture, inspection_result, advice):
     """The same as plain data."""
     from nerfies_jax.capture import gate
     from nerfies_jax.runs import prices
@@ -100,11 +100,11 @@ def _as_json(capture, inspected, advice):
     return {
         "capture": capture.name,
         "checks": [one._asdict() for one in gate.findings(capture)],
-        "findings": [dataclasses.asdict(one) for one in inspected.findings],
-        "cost per step": prices.as_json(inspected.findings),
+        "findings": [dataclasses.asdict(one) for one in inspection_result.findings],
+        "cost per step": prices.as_json(inspection_result.findings),
         "advice": [dataclasses.asdict(one) for one in advice],
-        "images downsampled by": inspected.factor,
-        "seconds": inspected.seconds,
+        "images downsampled by": inspection_result.factor,
+        "seconds": inspection_result.seconds,
     }
 
 

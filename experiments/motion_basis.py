@@ -81,22 +81,20 @@ def images(folder: pathlib.Path, bases: int, times: int) -> dict[str, list]:
     views = [evaluation.view_of(run.capture, row) for row in rows]
     params = state.params.nets[motion_basis.NAME]
     mean = state.params.rows["splats"].mean
-    prepared = motion_basis.prepare(params, spec, mean)
+    cache = motion_basis.prepare(params, spec, mean)
     weights = [
-        np.asarray(
-            motion_basis.blending_weights(params, spec, mean, view.time, prepared)
-        )
+        np.asarray(motion_basis.blending_weights(params, spec, mean, view.time, cache))
         for view in views
     ]
-    basis = np.asarray(prepared.basis)  # [gaussians, 3, count]
+    basis = np.asarray(cache.basis)  # [gaussians, 3, count]
     order = largest(basis, np.stack(weights))[:bases]
     images = [run.observed.images[row] / 255 for row in rows]
     directions = [
-        np.asarray(render(painted(state, signed_color(basis[..., k])), views[0]).color)
+        np.asarray(render(paint(state, signed_color(basis[..., k])), views[0]).color)
         for k in order
     ]
     of_first = [
-        np.asarray(render(painted(state, diverging(one[:, order[0]])), view).color)
+        np.asarray(render(paint(state, diverging(one[:, order[0]])), view).color)
         for one, view in zip(weights, views, strict=True)
     ]
     return {
@@ -150,7 +148,7 @@ def diverging(values: np.ndarray) -> np.ndarray:
     return gray + np.abs(share) * (ends - gray)
 
 
-def painted(state, color: np.ndarray):
+def paint(state, color: np.ndarray):
     """Return a state whose Gaussians have colors that do not depend on the view.
 
     Args:

@@ -60,15 +60,15 @@ def parse(settings: Any, arguments: list[str], prog: str) -> Any:
         options.
     """
     offering = any(word.startswith(COMPLETION) for word in arguments)
-    by_shown = {shown(kind, offering): kind for kind in _kinds(settings)}
-    union = functools.reduce(operator.or_, by_shown)
-    parsed: Any = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
-    return _settle(by_shown[type(parsed)], parsed)
+    settings_by_type = {parser_type(kind, offering): kind for kind in _kinds(settings)}
+    union = functools.reduce(operator.or_, settings_by_type)
+    parser_values: Any = tyro.cli(union, prog=prog, args=arguments, config=READ_BY)
+    return _settle(settings_by_type[type(parser_values)], parser_values)
 
 
-def offered(settings: Any) -> type:
+def completion_type(settings: Any) -> type:
     """Return the type that completes a command among all commands."""
-    kinds = [shown(kind, offering=True) for kind in _kinds(settings)]
+    kinds = [parser_type(kind, offering=True) for kind in _kinds(settings)]
     return kinds[0] if len(kinds) == 1 else several(kinds)
 
 
@@ -84,7 +84,7 @@ def _kinds(settings):
 
 
 @functools.cache
-def shown(settings: type, offering: bool = False, top: bool = True) -> type:
+def parser_type(settings: type, offering: bool = False, top: bool = True) -> type:
     """Make a class for tyro with the fields of settings, and `--json` at the top.
 
     Nested settings keep the defaults of their class. `offering` is for the completion
@@ -95,7 +95,7 @@ def shown(settings: type, offering: bool = False, top: bool = True) -> type:
     under: dict[str, list[Entry]] = {heading: [] for heading in heading_of.values()}
     for field, kind, marks in _fields(settings):
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            kind = shown(kind, offering, top=False)
+            kind = parser_type(kind, offering, top=False)
             entry = dataclasses.field(default_factory=kind)
             words: dict[str, Any] = {}
             if docs[field.name]:
@@ -106,9 +106,9 @@ def shown(settings: type, offering: bool = False, top: bool = True) -> type:
             kind = _plain(kind, marks, offering)
         if field.default is False:
             marks = (*marks, tyro.conf.FlagCreatePairsOff)
-        annotated: Any = Annotated[(kind, tyro.conf.arg(**words), *marks)]
+        annotation: Any = Annotated[(kind, tyro.conf.arg(**words), *marks)]
         place = under.get(heading_of.get(field.name), parts)
-        place.append((field.name, annotated, entry))
+        place.append((field.name, annotation, entry))
     if top:
         marks_of_json = tyro.conf.arg(help=JSON_HELP, help_behavior_hint="")
         flag = Annotated[bool, marks_of_json, tyro.conf.FlagCreatePairsOff]
@@ -172,14 +172,15 @@ def _words(doc, field):
     return words
 
 
-def _settle(settings, parsed):
-    """Convert what tyro parsed to the settings themselves."""
+def _settle(settings, parser_values):
+    """Convert values of the tyro parser to settings."""
     heading_of = _headings(settings)
     values = {}
     for field, kind, _ in _fields(settings):
         heading = heading_of.get(field.name)
         value = getattr(
-            parsed if heading is None else getattr(parsed, heading), field.name
+            parser_values if heading is None else getattr(parser_values, heading),
+            field.name,
         )
         values[field.name] = (
             _settle(kind, value) if dataclasses.is_dataclass(kind) else value

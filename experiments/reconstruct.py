@@ -172,7 +172,7 @@ def _outcome(args):
             cluster=cluster,
             wide=wide,
         )
-        watched = _open_viewer(args)
+        viewer = _open_viewer(args)
     from nerfies_jax import runs
     from nerfies_jax.runs import multiple_hosts
     from nerfies_jax.runtime import hosts
@@ -197,7 +197,7 @@ def _outcome(args):
                 expected=_expected_options(args),
                 overrides=(*steps, *args.set),
                 trusted=args.trust,
-                watched=watched,
+                watched=viewer,
                 **common,
             )
     config = RunConfig(
@@ -213,7 +213,7 @@ def _outcome(args):
             args.out,
             effects=args.effects,
             prepare=args.prepare,
-            watched=watched,
+            watched=viewer,
             **common,
         )
 

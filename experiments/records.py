@@ -33,12 +33,12 @@ def one(path: pathlib.Path, kinds: Mapping[str, type]) -> dict[str, Any] | None:
     return _read(path, kinds)
 
 
-def write(path: pathlib.Path, stored: dict[str, Any], *machines: dict) -> None:
+def write(path: pathlib.Path, record: dict[str, Any], *machines: dict) -> None:
     """Write the file of a measurement, with the machines and revision that made it.
 
     Args:
       path: The file.
-      stored: Its content. Processors of earlier parts are kept.
+      record: Its content. Processors of earlier parts are kept.
       *machines: Descriptions of the machines of the parts that were added.
     """
     from nerfies_jax.capture.json_files import write_json
@@ -46,9 +46,9 @@ def write(path: pathlib.Path, stored: dict[str, Any], *machines: dict) -> None:
     from nerfies_jax.training.provenance import revision
 
     for machine in machines:
-        stored["machine"] = clock.beside(machine, stored.get("machine", {}))
-    stored["revision"] = revision()
-    write_json(path, stored)
+        record["machine"] = clock.beside(machine, record.get("machine", {}))
+    record["revision"] = revision()
+    write_json(path, record)
 
 
 def _read(path, kinds, aside=False):

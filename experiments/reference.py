@@ -33,19 +33,21 @@ def main(args):
     render.configure(docformat="markdown", math=True)
     names = _public_names()
     # A package without a face of its own brings its modules along.
-    documented = [module for module in names if _has_face(module.rpartition(".")[0])]
-    pdoc.pdoc(*documented, output_directory=args.out)
-    undocumented = [
+    documented_modules = [
+        module for module in names if _has_face(module.rpartition(".")[0])
+    ]
+    pdoc.pdoc(*documented_modules, output_directory=args.out)
+    missing_names = [
         f"{module}.{name}"
         for module, present in names.items()
         for name in present
         if f'id="{name}"' not in page(args.out, module).read_text()
     ]
-    for name in undocumented:
+    for name in missing_names:
         console.error(f"{name} is on no page of the reference")
     console.say(f"{len(names)} modules: {args.out / 'index.html'}")
-    result = {"folder": str(args.out), "modules": len(names), "missing": undocumented}
-    return cli.Ended(result, 1 if undocumented else 0)
+    result = {"folder": str(args.out), "modules": len(names), "missing": missing_names}
+    return cli.Ended(result, 1 if missing_names else 0)
 
 
 def page(folder: pathlib.Path, module: str) -> pathlib.Path:

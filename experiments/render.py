@@ -135,33 +135,36 @@ def main(args):
             video.library()  # missing, it is said before anything is rendered
         run = runs.saved_run(args.run, trusted=args.trust)
         move = _mover(args, run)
-        restored = runs.restore(args.run, run)
-        state = restored.state
-        settings = _settings_of(args, restored)
+        run_checkpoint = runs.restore(args.run, run)
+        state = run_checkpoint.state
+        settings = _settings_of(args, run_checkpoint)
         run = runs.with_found_cameras(run, state)
-        trained = _view_of(args, run.model, state)
-        model, state = _faster(args, _model(args, run), trained)
+        trained_state = _view_of(args, run.model, state)
+        model, state = _faster(args, _model(args, run), trained_state)
         names, views, own_size = _views(args, run)
-        size = cli.sized(own_size, args.max_side)
+        size = cli.scale_size(own_size, args.max_side)
         views = [evaluation.resized(view, own_size, size) for view in views]
         views = _blend(args, run, views)
         files = _files(args, names)
         may_go = render_folder.replaceable(out, args, settings, files)
-    image_of = _Images(args.show, move, trained, views)
+    image_of = _Images(args.show, move, trained_state, views)
     renderer = evaluation.Renderer(model, size)
-    replaced = json_files.replaced_folder(out, True, may_go)
-    with cli.user_errors((CaptureError, OSError)), replaced as partial:
+    replacement = json_files.replaced_folder(out, True, may_go)
+    with cli.user_errors((CaptureError, OSError)), replacement as partial:
         _write(args, partial, renderer, state, names, views, image_of)
         record = render_folder.record(settings, args, files)
         json_files.write_json(partial / render_folder.RECORD, record)
     return _report(out, renderer, len(names), files)
 
 
-def _settings_of(args, restored):
+def _settings_of(args, run_checkpoint):
     """Collect the settings that determine the images."""
     from nerfies_jax.training import provenance
 
-    checkpoint = {"step": restored.step, "checkpoint": restored.about["crc32"]}
+    checkpoint = {
+        "step": run_checkpoint.step,
+        "checkpoint": run_checkpoint.about["crc32"],
+    }
     request = render_folder.request(args)
     return render_folder.Made(request, checkpoint, provenance.revision())
 
@@ -175,11 +178,11 @@ def _files(args, names):
 
 def _model(args, run):
     """Return the run's model or a variant; ValueError if it has no such variant."""
-    blended = args.appearance is not None
-    if not args.without and not blended:
+    blends = args.appearance is not None
+    if not args.without and not blends:
         return run.model
     return run.representation.products.variant(
-        run.spec, run.metadata, args.without, blended
+        run.spec, run.metadata, args.without, blends
     )
 
 
@@ -330,10 +333,10 @@ class _Images:
         if self.show == "flow":
             return self._draw_flow(rendering, place)
         opaque = rendering.alpha > 0.5
-        colored = panels.color_depth(rendering.depth, opaque, self.limits)
+        color_map = panels.color_depth(rendering.depth, opaque, self.limits)
         if opaque.any():
-            self.limits = colored.low, colored.high
-        return colored.image
+            self.limits = color_map.low, color_map.high
+        return color_map.image
 
     def _draw_flow(self, rendering, place):
         """Draw the flow to the next image; zero for the last one."""
@@ -342,10 +345,10 @@ class _Images:
 
         start, end = self._views[place], self._views[place : place + 2][-1]
         flow = model_flow.image_flow(self._move, self._state, start, end, rendering)
-        colored = panels.color_flow(flow, self.limits)
+        color_map = panels.color_flow(flow, self.limits)
         if np.nanmax(np.abs(flow), initial=0) > 0:
-            self.limits = colored.high
-        return colored.image
+            self.limits = color_map.high
+        return color_map.image
 
 
 if __name__ == "__main__":

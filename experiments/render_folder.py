@@ -103,18 +103,18 @@ def request(args: Any) -> dict[str, Any]:
       The values.
     """
     settings = dataclasses.asdict(args)
-    for ignored in _NOT_RENDERED:
-        del settings[ignored]
+    for field in _NOT_RENDERED:
+        del settings[field]
     settings["path"] = _digest(args.path) or args.path
     settings["formats"] = sorted(args.formats)
     return json.loads(json.dumps(settings))
 
 
-def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
+def record(metadata: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
     """Assemble `render.json`.
 
     Args:
-      made: Settings that determine the images.
+      metadata: Settings that determine the images.
       args: Settings of `nerfies render`.
       files: Files by their names in the folder.
 
@@ -124,7 +124,7 @@ def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
     from nerfies_jax.training.provenance import provenance
 
     return {
-        **made._asdict(),
+        **metadata._asdict(),
         "path": args.path,
         "made by": provenance(),
         "files": [*files, RECORD],
@@ -132,14 +132,14 @@ def record(made: Made, args: Any, files: Iterable[str]) -> dict[str, Any]:
 
 
 def replaceable(
-    out: pathlib.Path, args: Any, made: Made, files: Collection[str]
+    out: pathlib.Path, args: Any, metadata: Made, files: Collection[str]
 ) -> set[str]:
     """Find the files of an earlier render that this one may delete.
 
     Args:
       out: Folder of the render. It may be absent.
       args: Settings of `nerfies render`.
-      made: What decides the images of this render.
+      metadata: Settings that determine the images of this render.
       files: Names of the files that this render will write.
 
     Returns:
@@ -157,7 +157,7 @@ def replaceable(
         refuse_existing(out, args.overwrite)
         return alike(out, files)
     if not args.overwrite:
-        _refuse_other(out, made, earlier)
+        _refuse_other(out, metadata, earlier)
     return {*earlier["files"]}
 
 
@@ -180,8 +180,8 @@ def _earlier(out):
         valid = isinstance(earlier["request"], dict) and isinstance(
             earlier["run"], dict
         )
-        named = all(isinstance(name, str) for name in earlier["files"])
-        return earlier if valid and named and "revision" in earlier else None
+        has_names = all(isinstance(name, str) for name in earlier["files"])
+        return earlier if valid and has_names and "revision" in earlier else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -219,9 +219,9 @@ def _first_edit(out, earlier):
     string.
     """
     # The record is written last, and a rename changes no time.
-    finished = (out / RECORD).stat().st_mtime_ns
+    record_time = (out / RECORD).stat().st_mtime_ns
     for file in earlier["files"]:
         path = out / file
-        if path.is_file() and path.stat().st_mtime_ns > finished:
+        if path.is_file() and path.stat().st_mtime_ns > record_time:
             return f"{file} was changed after it was rendered"
     return ""

@@ -67,10 +67,10 @@ class Study(NamedTuple):
     about: str  # subject of the page
     command: str  # words after `nerfies study`
     module: str  # of experiments, whose docstring opens the page
-    page: str  # of experiments, with `page(stored)`
+    page: str  # of experiments, with `page(results)`
     measured: str = ""  # the stored file, if it is not in experiments/measured
-    figure: str = ""  # of experiments, with `draw(stored, path)`
-    # File of the library with what `advice(stored)` of the same module selects.
+    figure: str = ""  # of experiments, with `draw(results, path)`
+    # File of the library with what `advice(results)` of the same module selects.
     advice: str = ""
 
     @property
@@ -226,9 +226,9 @@ def _advise(name):
     study = STUDIES[name]
     if study.advice:
         module = importlib.import_module(f"experiments.{study.figure}")
-        selected = module.advice(json.loads(path_of(name).read_text()))
-        if selected:
-            write_json(ROOT / study.advice, selected)
+        advice = module.advice(json.loads(path_of(name).read_text()))
+        if advice:
+            write_json(ROOT / study.advice, advice)
 
 
 def _write(path, text):
@@ -266,7 +266,7 @@ def stored_pages() -> list[str]:
     return [name for name in STUDIES if path_of(name).exists()]
 
 
-def keep(name: str, measured: pathlib.Path) -> None:
+def keep(name: str, source: pathlib.Path) -> None:
     """Store a result as the numbers of a page.
 
     Benchmarks are added to the stored ones. Their methods replace those of the same
@@ -274,27 +274,27 @@ def keep(name: str, measured: pathlib.Path) -> None:
 
     Args:
       name: Name of the page.
-      measured: File of the result.
+      source: File of the result.
 
     Raises:
       ValueError: If no page can be written from the file.
     """
     try:
-        record = json.loads(measured.read_text())
+        record = json.loads(source.read_text())
     except json.JSONDecodeError as error:
-        raise ValueError(f"--measured {measured}: not JSON ({error})") from None
-    _check_of(name, record, measured)
+        raise ValueError(f"--measured {source}: not JSON ({error})") from None
+    _check_of(name, record, source)
     try:
         _page_of(name, record)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"--measured {measured}: not what {STUDIES[name].line} writes ({error!r})"
+            f"--measured {source}: not what {STUDIES[name].line} writes ({error!r})"
         ) from error
     path = path_of(name)
     if "benchmarks" in record and path.exists():
         _add(record, path)
     else:
-        _copy(measured, path)
+        _copy(source, path)
 
 
 def _add(record, path):
@@ -302,27 +302,27 @@ def _add(record, path):
     from nerfies_jax.capture.json_files import write_json
     from nerfies_jax.metrics import clock
 
-    stored = json.loads(path.read_text())
-    record["benchmarks"] = verdicts.merged(stored["benchmarks"], record["benchmarks"])
-    record["machine"] = clock.beside(record["machine"], stored["machine"])
+    earlier = json.loads(path.read_text())
+    record["benchmarks"] = verdicts.merge(earlier["benchmarks"], record["benchmarks"])
+    record["machine"] = clock.beside(record["machine"], earlier["machine"])
     write_json(path, record)
 
 
-def _check_of(name, stored, measured):
+def _check_of(name, record, source):
     """Raise ValueError if a file holds nothing, or results of another page."""
     # A number may be 0, as the seed of damaged files is.
-    if not isinstance(stored, dict) or not all(
-        value or isinstance(value, int | float) for value in stored.values()
+    if not isinstance(record, dict) or not all(
+        value or isinstance(value, int | float) for value in record.values()
     ):
-        raise ValueError(f"--measured {measured}: holds no results; measure again")
+        raise ValueError(f"--measured {source}: holds no results; measure again")
     words = STUDIES[name].command.split()
     for option in ("--suite", "--scene"):
         if option in words:
             option_words = " ".join(words[words.index(option) :][:2])
-            others = [x for x in stored.get("benchmarks", ()) if option_words not in x]
+            others = [x for x in record.get("benchmarks", ()) if option_words not in x]
             if others:
                 raise ValueError(
-                    f"--measured {measured}: of {others[0]}, and the page {name} is of "
+                    f"--measured {source}: of {others[0]}, and the page {name} is of "
                     f"{option_words}"
                 )
 
@@ -361,9 +361,9 @@ def index() -> str:
         for name, study in STUDIES.items()
         if path_of(name).exists()
     ]
-    stored = stored_pages()
+    stored_names = stored_pages()
     absent = [
-        f"`{study.line}`" for name, study in STUDIES.items() if name not in stored
+        f"`{study.line}`" for name, study in STUDIES.items() if name not in stored_names
     ]
     return INDEX.format(
         summaries=markdown.bullets(
@@ -378,16 +378,16 @@ def index() -> str:
     )
 
 
-def _page_of(name, stored):
+def _page_of(name, record):
     study = STUDIES[name]
     module = importlib.import_module(f"experiments.{study.module}")
     title, text = markdown.title_and_text(module.__doc__)
-    about = stored.get("machine") or stored["about"]
+    about = record.get("machine") or record["about"]
     parts = [title, text]
     if (PAGES / f"{name}.png").exists():
         parts.append(f"![{title.removeprefix('# ')}]({name}.png)")
-    parts.append(importlib.import_module(f"experiments.{study.page}").page(stored))
-    revision = stored.get("revision")
+    parts.append(importlib.import_module(f"experiments.{study.page}").page(record))
+    revision = record.get("revision")
     origin = markdown.machine(about) + (f", revision {revision}" if revision else "")
     stored_in = path_of(name).relative_to(ROOT)
     parts.append(

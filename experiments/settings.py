@@ -33,9 +33,9 @@ def main(args):
     with cli.user_errors():
         platform.start_jax("cpu")
         kind = representations.of_preset(args.preset)
-    described = _describe_preset(kind, args.preset)
-    console.say("\n".join(lines(described)))
-    return described
+    description = _describe_preset(kind, args.preset)
+    console.say("\n".join(lines(description)))
+    return description
 
 
 def _describe_preset(kind: Any, preset: str) -> dict[str, Any]:
@@ -59,13 +59,13 @@ def _describe_preset(kind: Any, preset: str) -> dict[str, Any]:
     return {"preset": preset, "source": _place(type(spec)), "fields": fields}
 
 
-def lines(described: dict[str, Any]) -> list[str]:
+def lines(description: dict[str, Any]) -> list[str]:
     """Format fields under the settings that have them."""
     groups: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = {}
-    for path, field in described["fields"].items():
+    for path, field in description["fields"].items():
         above = path.rpartition(".")[0]
         groups.setdefault((above, field["source"]), []).append((path, field))
-    text = [f"{described['preset']}, as --set takes it:"]
+    text = [f"{description['preset']}, as --set takes it:"]
     for (above, source), fields in groups.items():
         title = f"{above or 'the scene'}: {fields[0][1]['of']}"
         text += ["", *textwrap.wrap(title, WIDTH), f"({source})"]

@@ -52,11 +52,11 @@ def main(args):
 
         viewer.check_installed()
         run = runs.saved_run(args.run, trusted=args.trust)
-        restored = runs.restore(args.run, run)
-        size = cli.sized(run.capture.size, args.max_side)
+        run_checkpoint = runs.restore(args.run, run)
+        size = cli.scale_size(run.capture.size, args.max_side)
         page = viewer.Viewer(run, size, args.port, args.run)
         course = curves.course_of(args.run)
-        rows = (restored.record or {}).get("rows", ())
+        rows = (run_checkpoint.record or {}).get("rows", ())
         page.add_history(rows if course is None else course.training or rows)
     if course is not None and not course.ended:
         console.say(
@@ -65,10 +65,10 @@ def main(args):
     console.say(f"look around at {page.address} (Ctrl-C ends)")
     with contextlib.suppress(KeyboardInterrupt):
         while not stopping.requested():
-            page.serve(restored.state, restored.step, seconds=1.0)
+            page.serve(run_checkpoint.state, run_checkpoint.step, seconds=1.0)
             time.sleep(viewer.IDLE_SECONDS)
     page.close()
-    return {"run": args.run, "step": restored.step, "address": page.address}
+    return {"run": args.run, "step": run_checkpoint.step, "address": page.address}
 
 
 if __name__ == "__main__":

@@ -103,8 +103,8 @@ class Batch:
         cli.check_max_side(self.max_side)
         for name in self.preset:
             if name not in representations.PRESETS:
-                known = known_names(name, representations.PRESETS)
-                raise ValueError(f"--preset {name}: no such preset; {known}")
+                choices = known_names(name, representations.PRESETS)
+                raise ValueError(f"--preset {name}: no such preset; {choices}")
         if self.scheduler is not None and self.engine != "dask":
             raise ValueError(f"--scheduler {self.scheduler}: only with --engine dask")
         if self.slurm and self.engine != "slurm":
@@ -152,10 +152,10 @@ def main(args):
         engine = _engine(args)
         args.out.mkdir(parents=True, exist_ok=True)
         _check_settings(args)
-        runs = planned(args)
-    unfinished = [run.task for run in runs if tasks.result(run.task) is None]
+        runs = plan_runs(args)
+    missing_tasks = [run.task for run in runs if tasks.result(run.task) is None]
     endings = {}
-    for task, ending in engines.execute(unfinished, engine, args.retries):
+    for task, ending in engines.execute(missing_tasks, engine, args.retries):
         result = tasks.result(task)
         if result is None:
             endings[task] = ending
@@ -190,9 +190,11 @@ def _check_settings(args):
     """Raise ValueError if the folder holds a batch with other settings."""
     record = records.rows(args.out / STORED)
     earlier = record.get("settings", args.settings)
-    changed = [name for name in args.settings if earlier[name] != args.settings[name]]
-    if changed:
-        name = changed[0]
+    changed_names = [
+        name for name in args.settings if earlier[name] != args.settings[name]
+    ]
+    if changed_names:
+        name = changed_names[0]
         raise ValueError(
             f"--out {args.out}: holds a batch with {name}={earlier[name]}, and this "
             f"one has {args.settings[name]}; choose another folder"
@@ -200,7 +202,7 @@ def _check_settings(args):
     records.write(args.out / STORED, {**record, "settings": args.settings})
 
 
-def planned(args: Batch) -> list[Run]:
+def plan_runs(args: Batch) -> list[Run]:
     """List all runs, those of the first seed first.
 
     Args:
@@ -270,17 +272,21 @@ def keep(
 
     path = args.out / STORED
     results = {run: tasks.result(run.task) for run in runs}
-    finished = {run: result for run, result in results.items() if result is not None}
+    complete_results = {
+        run: result for run, result in results.items() if result is not None
+    }
     rows = []
     for capture, preset in dict.fromkeys((run.capture, run.preset) for run in runs):
-        these = [run for run in finished if run[:2] == (capture, preset)]
+        these = [run for run in complete_results if run[:2] == (capture, preset)]
         rows.append(
             {
                 "capture": capture,
                 "preset": preset,
-                "trained": sorted({finished[run].preset for run in these}),
-                "runs": [tasks.shown(run.task.folder, args.out) for run in these],
-                **verdicts.summary([finished[run].metrics for run in these]),
+                "trained": sorted({complete_results[run].preset for run in these}),
+                "runs": [
+                    tasks.display_path(run.task.folder, args.out) for run in these
+                ],
+                **verdicts.summary([complete_results[run].metrics for run in these]),
             }
         )
     failures = [
@@ -288,12 +294,14 @@ def keep(
             "run": task.name,
             "code": ending.code,
             "reason": ending.reason,
-            "log": tasks.shown(task.log, args.out),
+            "log": tasks.display_path(task.log, args.out),
         }
         for task, ending in endings.items()
     ]
     record = {"settings": args.settings, "rows": rows, "failures": failures}
-    records.write(path, record, *(result.machine for result in finished.values()))
+    records.write(
+        path, record, *(result.machine for result in complete_results.values())
+    )
     page.write(args.out / "index.html", record)
     console.say(page.table(record))
     if failures:

@@ -75,11 +75,11 @@ def local(tasks: Iterable[Task], jobs: int = 1) -> Iterator[tuple[Task, Ending]]
                 running[pool.submit(task, stop)] = task
             if not running:
                 return
-            done, _ = concurrent.futures.wait(
+            completed_futures, _ = concurrent.futures.wait(
                 running, POLL_SECONDS, concurrent.futures.FIRST_COMPLETED
             )
-            for one in done:
-                yield running.pop(one), one.result()
+            for future in completed_futures:
+                yield running.pop(future), future.result()
             stopping.check()
     finally:
         stop.set()
@@ -116,9 +116,9 @@ def dask(
         # A task that is continued needs another key.
         running = {client.submit(task, key=uuid.uuid4().hex): task for task in tasks}
         while running:
-            for one in [one for one in running if one.done()]:
-                error = one.exception() if one.status != "finished" else None
-                yield running.pop(one), _failure(error) if error else one.result()
+            for future in [future for future in running if future.done()]:
+                error = future.exception() if future.status != "finished" else None
+                yield running.pop(future), _failure(error) if error else future.result()
             time.sleep(POLL_SECONDS)
             stopping.check()
 
@@ -152,8 +152,8 @@ def slurm(
         **_slot(tasks),
     )
     with _importable(), executor.batch():
-        submitted = [executor.submit(task) for task in tasks]
-    running = dict(zip(submitted, tasks, strict=True))
+        submitted_jobs = [executor.submit(task) for task in tasks]
+    running = dict(zip(submitted_jobs, tasks, strict=True))
     try:
         while running:
             for job in [job for job in running if job.done()]:

@@ -24,37 +24,37 @@ HEADS = ("capture", "preset", "seeds", *(column[1] for column in COLUMNS))
 STYLE_OF_TABLE = "td, th { white-space: nowrap; } td img { width: 20rem; }"
 
 
-def table(stored: Mapping[str, Any]) -> str:
+def table(results: Mapping[str, Any]) -> str:
     """Format the results of a batch for a terminal.
 
     Args:
-      stored: The content of batch.json.
+      results: The content of batch.json.
 
     Returns:
       A table in Markdown.
     """
-    return markdown.table(HEADS, map(_cells, stored["rows"]), words=2)
+    return markdown.table(HEADS, map(_cells, results["rows"]), words=2)
 
 
-def write(path: pathlib.Path, stored: Mapping[str, Any]) -> None:
+def write(path: pathlib.Path, results: Mapping[str, Any]) -> None:
     """Write the page of a batch, with links to the reports and logs of its runs.
 
     Args:
       path: The page, in the folder that the stored paths are relative to.
-      stored: The content of batch.json.
+      results: The content of batch.json.
     """
-    rows = "".join(map(_row, stored["rows"]))
+    rows = "".join(map(_row, results["rows"]))
     heads = "".join(f'<th scope="col">{head}</th>' for head in (*HEADS, "reports", ""))
     failures = "".join(
         f"<li>{html.escape(each['run'])}: exit code {each['code']}, "
         f"{html.escape(each['reason'])} ({_link(each['log'], 'log')})</li>"
-        for each in stored["failures"]
+        for each in results["failures"]
     )
     legend = "".join(
         f"<li>{head}: {html.escape(METRICS[key].explanation)}</li>"
         for key, head, *_ in COLUMNS
     )
-    title = f"{len(stored['rows'])} reconstructions, {len(stored['failures'])} failed"
+    title = f"{len(results['rows'])} reconstructions, {len(results['failures'])} failed"
     text = (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -71,8 +71,8 @@ def write(path: pathlib.Path, stored: Mapping[str, Any]) -> None:
 
 
 def _cells(row):
-    trained = [] if row["trained"] in ([], [row["preset"]]) else row["trained"]
-    preset = " ".join([row["preset"], *(f"({name})" for name in trained)])
+    trained_presets = [] if row["trained"] in ([], [row["preset"]]) else row["trained"]
+    preset = " ".join([row["preset"], *(f"({name})" for name in trained_presets)])
     return [row["capture"], preset, str(row["seeds"]), *map(_cell_of(row), COLUMNS)]
 
 

@@ -146,12 +146,14 @@ class Task:
                 if now < next_look or math.isinf(self.limits.memory_bytes):
                     continue
                 next_look = now + MEMORY_SECONDS
-                used = _memory(process)
-                if used > self.limits.memory_bytes:
+                memory_bytes = _memory(process)
+                if memory_bytes > self.limits.memory_bytes:
                     # Saving could take more memory. The last checkpoint stays.
                     process.kill()
                     limit = f"limit of {self.limits.memory_bytes / 1e9:.3g} GB"
-                    reason = f"used {used / 1e9:.3g} GB, above the memory {limit}"
+                    reason = (
+                        f"used {memory_bytes / 1e9:.3g} GB, above the memory {limit}"
+                    )
                     return Ending(process.wait(), reason)
         finally:
             _end(process)
@@ -249,11 +251,11 @@ def failure(task: Task, ending: Ending) -> str:
     """Describe how a run failed, with the file of its log."""
     return (
         f"{task.name}: failed with exit code {ending.code}: {ending.reason} "
-        f"({shown(task.log)})"
+        f"({display_path(task.log)})"
     )
 
 
-def shown(path: pathlib.Path, base: pathlib.Path | None = None) -> str:
+def display_path(path: pathlib.Path, base: pathlib.Path | None = None) -> str:
     """Return a path relative to a folder, by default the current one, that contains it.
 
     Args:

@@ -148,18 +148,22 @@ def main(args):
         if folder is not None and not folder.exists():
             raise ValueError(f"{folder}: no such file or folder; check the path")
         for settings in args.chosen.values():
-            representations.cores(*suites.parsed(settings))  # refuses wrong settings
+            representations.cores(
+                *suites.parse_settings(settings)
+            )  # refuses wrong settings
         args.out.mkdir(parents=True, exist_ok=True)
-        runs = planned(args)
+        runs = plan_runs(args)
         failures = _execute(args, runs)
     results = {run: tasks.result(run.task) for run in runs}
-    finished = {run: result for run, result in results.items() if result is not None}
-    if finished:
-        keep(args, finished)
+    complete_results = {
+        run: result for run, result in results.items() if result is not None
+    }
+    if complete_results:
+        keep(args, complete_results)
     return cli.Ended(cli.stored(args.out / STORED), 1 if failures else 0)
 
 
-def planned(args: Benchmark) -> list[Run]:
+def plan_runs(args: Benchmark) -> list[Run]:
     """List all runs, those of the first seed first.
 
     Args:
@@ -174,7 +178,7 @@ def planned(args: Benchmark) -> list[Run]:
     runs = []
     for seed in range(args.seeds):
         for method, settings in args.chosen.items():
-            preset, changes = suites.parsed(settings)
+            preset, changes = suites.parse_settings(settings)
             words = tasks.options(
                 source, preset, changes, seed, *_lengths(args, method)
             )
@@ -204,8 +208,8 @@ def _execute(args, runs):
     Wrong input, which is that of all runs, raises ValueError.
     """
     failures = []
-    unfinished = [run.task for run in runs if tasks.result(run.task) is None]
-    for task, ending in engines.local(unfinished, args.jobs):
+    missing_tasks = [run.task for run in runs if tasks.result(run.task) is None]
+    for task, ending in engines.local(missing_tasks, args.jobs):
         result = tasks.result(task)
         if result is not None:
             console.say(f"{task.name}: {tasks.summary(result.metrics)}")
@@ -235,7 +239,9 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
         of_method = {run.seed: results[run] for run in results if run.method == method}
         presets = dict.fromkeys(one.preset for one in of_method.values())
         if of_method:
-            settings = settings if suites.parsed(settings)[0] else " / ".join(presets)
+            settings = (
+                settings if suites.parse_settings(settings)[0] else " / ".join(presets)
+            )
             methods[method] = {
                 "settings": settings,
                 "revision": revision(),
@@ -256,7 +262,7 @@ def keep(args: Benchmark, results: Mapping[Run, tasks.Result]) -> None:
     record["benchmarks"][args.label] = benchmark
     records.write(path, record, *(result.machine for result in results.values()))
     console.say(page.page({"benchmarks": {args.label: benchmark}}))
-    folders = [tasks.shown(run.task.folder) for run in results if run.seed == 0]
+    folders = [tasks.display_path(run.task.folder) for run in results if run.seed == 0]
     if len(folders) > 1:
         words = shlex.join(folders)
         console.say(f"images: nerfies compare {words}")

@@ -124,7 +124,7 @@ def comparisons(league: Mapping[str, Any], notes: Mapping[str, str]) -> list[Row
         for other, score in table.others.items():
             gains = tuple(
                 {
-                    capture: _paired(
+                    capture: _compute_gain(
                         row_of(contest, table.preset, start),
                         row_of(contest, other, start),
                     )
@@ -153,7 +153,7 @@ def row_of(rows: Mapping[str, Any], preset: str, start: str) -> Any:
     return rows.get(f"{preset}+{start}", rows[preset])
 
 
-def _paired(better, worse):
+def _compute_gain(better, worse):
     """Return the gain between two rows of the league over the seeds of both."""
     numbers = {
         (name, int(seed)): {PSNR: cell["numbers"]["psnr"]}
@@ -277,8 +277,8 @@ def _notes(ablations):
             name,
             other,
         ): f"{methods[other]['mean'][PSNR] - methods['full']['mean'][PSNR]:.1f}"
-        for name, stored in ablations.items()
-        for methods in (one["methods"] for one in stored["benchmarks"].values())
+        for name, results in ablations.items()
+        for methods in (one["methods"] for one in results["benchmarks"].values())
         for other in ("no-neighbors", "no-alternation")
         if other in methods
     }
@@ -299,8 +299,10 @@ def _counts(rows, start):
     counts = Counter(row.verdicts[start] for row in rows)
     words = {HOLDS: "hold", FAILS: "do not", UNDECIDED: "are undecided"}
     words |= {UNKNOWN: "are not measured"}
-    listed = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return " and ".join([", ".join(listed[:-1]), listed[-1]] if listed[1:] else listed)
+    phrases = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    return " and ".join(
+        [", ".join(phrases[:-1]), phrases[-1]] if phrases[1:] else phrases
+    )
 
 
 def _table(what, rows, starts):
@@ -311,10 +313,10 @@ def _table(what, rows, starts):
     cells = []
     for row in rows:
         line = [row.paper, row.other, row.margin]
-        for gains, judged in zip(row.gains, row.verdicts, strict=True):
+        for gains, row_verdict in zip(row.gains, row.verdicts, strict=True):
             line.append("; ".join(_cell(gains.get(capture)) for capture in CAPTURES))
             mean = statistics.fmean(gain.mean for gain in gains.values())
-            line += [f"{mean:+.2f}", judged]
+            line += [f"{mean:+.2f}", row_verdict]
         cells.append([*line, row.why])
     return markdown.table([*heads, "reason"], cells, words=len(heads) + 1)
 
@@ -352,8 +354,13 @@ def _cost(league):
             ]
         )
     rows = [
-        [name, f"{value:,}", *(_mean(column[k], digits) for column in columns), judged]
-        for k, (name, value, digits, judged) in enumerate(published.COST)
+        [
+            name,
+            f"{value:,}",
+            *(_mean(column[k], digits) for column in columns),
+            cost_verdict,
+        ]
+        for k, (name, value, digits, cost_verdict) in enumerate(published.COST)
     ]
     heads = ("cost", "published", *CAPTURES, "verdict")
     return markdown.table(heads, rows)
@@ -368,13 +375,13 @@ def _mean(values, digits):
     return markdown.with_spread(statistics.fmean(values), spread, digits)
 
 
-def _random(stored):
+def _random(results):
     """Describe the gain of random points over those of structure from motion."""
     words = []
-    for one in stored["about"]["claims"]:
-        if one["arms"][0].startswith("random") and one["measure"] == "psnr":
-            start = "rest" if "rest" in one["arms"][0] else "tracks"
-            gain = Gain(one["gain"], one["half_width"])
+    for claim in results["about"]["claims"]:
+        if claim["arms"][0].startswith("random") and claim["measure"] == "psnr":
+            start = "rest" if "rest" in claim["arms"][0] else "tracks"
+            gain = Gain(claim["gain"], claim["half_width"])
             words.append(f"{_cell(gain)} dB from {start} ({verdict([gain])})")
     return (
         "MoBa-GS with random points gains over points of structure from motion on "

@@ -112,18 +112,18 @@ def psnr_at(line: Line, seconds: float | int) -> float | None:
     return float(np.interp(math.log(seconds), np.log(line.seconds), line.psnr))
 
 
-def advice(stored: Mapping[str, Any]) -> dict[str, Any]:
+def advice(results: Mapping[str, Any]) -> dict[str, Any]:
     """Select the curves that `nerfies_jax.evaluation.method_curves` ranks presets by.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Mean curves over the seeds by scene, and by preset and changes.
     """
     scenes: dict[str, Any] = {}
     for label in PANELS:
-        benchmark = stored["benchmarks"].get(label, {"methods": {}})
+        benchmark = results["benchmarks"].get(label, {"methods": {}})
         for name, line in lines(benchmark).items():
             curve = {
                 "seconds": [round(at, 2) for at in line.seconds],
@@ -134,31 +134,31 @@ def advice(stored: Mapping[str, Any]) -> dict[str, Any]:
     return scenes
 
 
-def panels(stored: Mapping[str, Any]) -> dict[str, dict[str, Line]]:
+def panels(results: Mapping[str, Any]) -> dict[str, dict[str, Line]]:
     """Collect what the figure shows.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Lines by title of the panel and method, without panels that have no curves.
     """
-    benchmarks = stored["benchmarks"]
-    collected = {
+    benchmarks = results["benchmarks"]
+    all_panels = {
         title: lines(benchmarks[label])
         for label, title in PANELS.items()
         if label in benchmarks
     }
-    return {title: curves for title, curves in collected.items() if curves}
+    return {title: curves for title, curves in all_panels.items() if curves}
 
 
-def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
+def draw(results: Mapping[str, Any], path: pathlib.Path) -> None:
     """Plot PSNR over processor seconds, with one panel for each scene.
 
     Lines are means over the seeds, and bands reach from the lowest to the highest seed.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
       path: The PNG file. Nothing is written if there are no curves.
 
     Raises:
@@ -166,7 +166,7 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     """
     from nerfies_jax.visualization import figures
 
-    panel_list = panels(stored)
+    panel_list = panels(results)
     if not panel_list:
         return
     figure = figures.new_figure(figsize=(8.4, 3.7), dpi=200, layout="constrained")

@@ -61,17 +61,17 @@ ended. A + marks changes that were not committed, or that only the revision befo
 numbers were committed is known."""
 
 
-def page(stored: Mapping[str, Any]) -> str:
+def page(results: Mapping[str, Any]) -> str:
     """Format the tables below the docstring.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Markdown.
     """
     single, parts = {}, [READING]
-    for label, benchmark in stored["benchmarks"].items():
+    for label, benchmark in results["benchmarks"].items():
         if benchmark["suite"] is None:
             (single[label],) = _methods(benchmark).values()
         else:
@@ -80,7 +80,7 @@ def page(stored: Mapping[str, Any]) -> str:
         parts += _tables("run", single)
     methods = [
         method
-        for benchmark in stored["benchmarks"].values()
+        for benchmark in results["benchmarks"].values()
         for method in benchmark["methods"].values()
     ]
     return "\n\n".join([*parts, markdown.bullets(_legend(methods))])

@@ -43,29 +43,35 @@ def panels(league: Mapping[str, Any], ablation: Mapping[str, Any]) -> list[Panel
     """
     table, parts = published.TABLES[0], published.ABLATIONS[0]
     methods = {table.preset: table.score, **table.others}
-    ablated = {"full": parts.score} | {one.worse: one.score for one in parts.parts}
+    ablation_scores = {"full": parts.score} | {
+        one.worse: one.score for one in parts.parts
+    }
     (benchmark,) = ablation["benchmarks"].values()
-    of_parts = {name: benchmark["methods"][name]["mean"] for name in ablated}
+    of_parts = {name: benchmark["methods"][name]["mean"] for name in ablation_scores}
     keys = ("heldout.psnr", "heldout.ssim", "heldout.moving_psnr")
     return [
-        Panel("Table 1, as published", PUBLISHED, normalized(_known(methods))),
+        Panel("Table 1, as published", PUBLISHED, normalize(_select_complete(methods))),
         Panel(
             "the same small presets here",
             OURS,
-            normalized({name: _measured(league, name) for name in methods}),
+            normalize({name: _mean_scores(league, name) for name in methods}),
         ),
-        Panel("ablation, as published", PUBLISHED, normalized(_known(ablated))),
+        Panel(
+            "ablation, as published",
+            PUBLISHED,
+            normalize(_select_complete(ablation_scores)),
+        ),
         Panel(
             "the same ablation here",
             OURS,
-            normalized(
+            normalize(
                 {name: tuple(m[key] for key in keys) for name, m in of_parts.items()}
             ),
         ),
     ]
 
 
-def _known(scores: Mapping[str, Score]) -> Scores:
+def _select_complete(scores: Mapping[str, Score]) -> Scores:
     return {
         name: (one.psnr, one.ssim, 1 - one.lpips)
         for name, one in scores.items()
@@ -73,7 +79,7 @@ def _known(scores: Mapping[str, Score]) -> Scores:
     }
 
 
-def _measured(league, preset):
+def _mean_scores(league, preset):
     """Mean scores of a preset over captures and seeds."""
     contests = (one for one in league["contests"] if one["capture"] in claims.CAPTURES)
     cells = [
@@ -85,7 +91,7 @@ def _measured(league, preset):
     return tuple(statistics.fmean(cell[key] for cell in cells) for key in keys)
 
 
-def normalized(scores: Scores) -> Scores:
+def normalize(scores: Scores) -> Scores:
     """Scale every axis so that the lowest score is 0 and the highest is 1.
 
     Args:
@@ -119,17 +125,17 @@ def draw(
     """
     from nerfies_jax.visualization import figures
 
-    shown = panels(league, ablation)
+    panel_list = panels(league, ablation)
     figure = figures.new_figure(figsize=(8.4, 7.6), dpi=110, layout="constrained")
     rows = figure.subfigures(2, 1)
-    for row, pair in zip(rows, (shown[:2], shown[2:]), strict=True):
+    for row, pair in zip(rows, (panel_list[:2], panel_list[2:]), strict=True):
         all_axes = row.subplots(1, 2, subplot_kw={"projection": "polar"})
         colors = dict(zip(pair[1].scores, COLORS, strict=False))
         for axes, panel in zip(all_axes, pair, strict=True):
             _draw_panel(axes, panel, colors)
         handles, labels = all_axes[-1].get_legend_handles_labels()
         row.legend(handles, labels, loc="outside right center", fontsize=8)
-    figures.save(figure, path, shown)
+    figures.save(figure, path, panel_list)
 
 
 def _draw_panel(axes, panel, colors):

@@ -30,7 +30,7 @@ class Suite(NamedTuple):
     steps: Mapping[str, int] = {}
 
 
-def parsed(settings: str) -> tuple[str | None, tuple[str, ...]]:
+def parse_settings(settings: str) -> tuple[str | None, tuple[str, ...]]:
     """Split the settings of a method.
 
     Args:

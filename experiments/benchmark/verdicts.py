@@ -49,24 +49,24 @@ def summary(seeds: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     }
 
 
-def curve(measured: Curve) -> dict[str, Any]:
+def curve(run_curve: Curve) -> dict[str, Any]:
     """Select what is stored of the curve of a run.
 
     Args:
-      measured: The curve.
+      run_curve: The curve.
 
     Returns:
       Number of evaluated frames, and lists of steps, processor seconds and scores, as
       JSON values.
     """
     lists = {
-        "steps": measured.steps,
-        "cpu_seconds": [_round(value, 2) for value in measured.cpu_seconds],
-        "psnr": [_round(value, 3) for value in measured.psnr],
-        "ssim": [_round(value, 4) for value in measured.ssim],
+        "steps": run_curve.steps,
+        "cpu_seconds": [_round(value, 2) for value in run_curve.cpu_seconds],
+        "psnr": [_round(value, 3) for value in run_curve.psnr],
+        "ssim": [_round(value, 4) for value in run_curve.ssim],
     }
     values = {name: list(each) for name, each in lists.items()}
-    return {"frames": len(measured.frames), **values}
+    return {"frames": len(run_curve.frames), **values}
 
 
 def _round(value, digits):
@@ -121,7 +121,7 @@ def _verdict(claim, metric, gains):
     return Verdict(statement, better, worse, metric, gain, half_width, text)
 
 
-def merged(
+def merge(
     earlier: Mapping[str, dict[str, Any]], later: Mapping[str, dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
     """Replace benchmarks, and methods and claims of benchmarks, by later ones.
@@ -133,21 +133,21 @@ def merged(
     Returns:
       All benchmarks. Each method has the revision that measured it.
     """
-    both = dict(earlier)
+    benchmarks = dict(earlier)
     for label, new in later.items():
-        old = both.get(label, {"methods": {}, "claims": []})
+        old = benchmarks.get(label, {"methods": {}, "claims": []})
         methods = {
-            name: {"revision": old["revision"]} | one
-            for name, one in old["methods"].items()
+            name: {"revision": old["revision"]} | entry
+            for name, entry in old["methods"].items()
         }
         # Others compared a method that was measured again.
         claims = [
-            one
-            for one in old["claims"]
-            if not {one["better"], one["worse"]} & set(new["methods"])
+            entry
+            for entry in old["claims"]
+            if not {entry["better"], entry["worse"]} & set(new["methods"])
         ]
-        both[label] = new | {
+        benchmarks[label] = new | {
             "methods": methods | new["methods"],
             "claims": [*claims, *new["claims"]],
         }
-    return both
+    return benchmarks

@@ -69,10 +69,10 @@ def main(args):
     record["revisions"] = [*dict.fromkeys([*record.get("revisions", []), revision()])]
     names = [args.only] if args.only else [*TARGETS]
     start, rounds = time.monotonic(), 1
-    while (remaining := args.mutations - _done(record)) > 0:
+    while (remaining := args.mutations - _count_mutations(record)) > 0:
         for name in names:
-            spent = time.monotonic() - start
-            if args.seconds is not None and spent > args.seconds:
+            elapsed_seconds = time.monotonic() - start
+            if args.seconds is not None and elapsed_seconds > args.seconds:
                 remaining = 0
                 break
             stopping.check()
@@ -86,34 +86,36 @@ def main(args):
             break
         rounds = min(4 * rounds, 32)
     failures = sum(sum(one["failures"].values()) for one in record["targets"].values())
-    console.say(f"{_done(record)} mutations, {failures} failures; kept in {path}")
+    console.say(
+        f"{_count_mutations(record)} mutations, {failures} failures; kept in {path}"
+    )
     return cli.Ended(record, 1 if failures else 0)
 
 
-def _done(stored):
-    return sum(one["mutations"] for one in stored["targets"].values())
+def _count_mutations(record):
+    return sum(target["mutations"] for target in record["targets"].values())
 
 
-def _extend(stored, name, count, args):
+def _extend(record, name, count, args):
     """Let a process of its own read so many more mutations of a target."""
-    one = stored["targets"].setdefault(
+    target = record["targets"].setdefault(
         name,
         {"mutations": 0, "read": 0, "refused": 0, "failures": {}}
         | {"seconds": 0.0, "bytes": 0, "examples": []},
     )
-    first = one["mutations"]
-    counts = _run(args.out.resolve(), name, first, first + count, stored["seed"])
+    first = target["mutations"]
+    counts = _run(args.out.resolve(), name, first, first + count, record["seed"])
     for key in ("read", "refused"):
-        one[key] += counts[key]
+        target[key] += counts[key]
     for key in ("seconds", "bytes"):
-        one[key] = max(one[key], counts[key])
-    one["mutations"] = first + counts["mutations"]
-    for failed in counts["failures"]:
-        words = failed["failure"]
-        if words not in one["failures"]:
-            console.say(f"{name}: {words} (mutation {failed['number']})")
-            one["examples"].append(failed)
-        one["failures"][words] = one["failures"].get(words, 0) + 1
+        target[key] = max(target[key], counts[key])
+    target["mutations"] = first + counts["mutations"]
+    for failure in counts["failures"]:
+        words = failure["failure"]
+        if words not in target["failures"]:
+            console.say(f"{name}: {words} (mutation {failure['number']})")
+            target["examples"].append(failure)
+        target["failures"][words] = target["failures"].get(words, 0) + 1
 
 
 def _run(out, name, first, last, seed):

@@ -84,8 +84,8 @@ def _set_integer(data, draw):
     end = min(len(data), draw.choice((64, 512, len(data)))) - size
     at = draw.randint(0, max(end, 0))
     value = draw.choice(LONG if size == 8 else INTEGERS) % 2 ** (8 * size)
-    packed = value.to_bytes(size, draw.choice(("little", "big")))
-    return data[:at] + packed + data[at + size :]
+    int_bytes = value.to_bytes(size, draw.choice(("little", "big")))
+    return data[:at] + int_bytes + data[at + size :]
 
 
 def _cut(data, draw):
@@ -145,10 +145,10 @@ _OF_TEXT = (
 
 def _in_zip(data, draw):
     """Damage one member of an archive, whose checksums are then right again."""
-    packed = io.BytesIO()
+    buffer = io.BytesIO()
     with (
         zipfile.ZipFile(io.BytesIO(data)) as archive,
-        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as out,
+        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as out,
     ):
         members = archive.namelist()
         hit = draw.choice(members)
@@ -157,7 +157,7 @@ def _in_zip(data, draw):
             if member == hit:
                 content = mutate(content, _kind(content), draw)
             out.writestr(member, content)
-    return packed.getvalue()
+    return buffer.getvalue()
 
 
 def _kind(content):

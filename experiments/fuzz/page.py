@@ -3,32 +3,35 @@
 from experiments import markdown
 
 
-def page(stored: dict) -> str:
+def page(results: dict) -> str:
     """Count the damaged files that each reader read or refused, and the failures."""
     rows, failures = [], []
-    for name, one in stored["targets"].items():
-        wrong = sum(one["failures"].values())
-        cells = (one["mutations"], one["read"], one["refused"], wrong)
+    for name, target in results["targets"].items():
+        wrong = sum(target["failures"].values())
+        cells = (target["mutations"], target["read"], target["refused"], wrong)
         rows.append(
             [
                 name,
                 *(f"{cell:,}" for cell in cells),
-                markdown.number(one["seconds"], 2),
-                markdown.number(one["bytes"] / 2**20, 0),
+                markdown.number(target["seconds"], 2),
+                markdown.number(target["bytes"] / 2**20, 0),
             ]
         )
         failures += [
-            f"{name}: {what} ({n} times)" for what, n in one["failures"].items()
+            f"{name}: {failure} ({n} times)"
+            for failure, n in target["failures"].items()
         ]
-    total = sum(one["mutations"] for one in stored["targets"].values())
-    wrong = sum(sum(one["failures"].values()) for one in stored["targets"].values())
+    total = sum(target["mutations"] for target in results["targets"].values())
+    wrong = sum(
+        sum(target["failures"].values()) for target in results["targets"].values()
+    )
     heads = (
         *("reader", "files", "read", "refused", "failures"),
         *("longest, CPU s", "growth, MB"),
     )
     parts = [
         f"Of {total:,} damaged files {wrong:,} were neither read nor refused with the "
-        f"file's path ({_revisions(stored)}).",
+        f"file's path ({_revisions(results)}).",
         markdown.table(heads, rows),
     ]
     if failures:
@@ -36,6 +39,6 @@ def page(stored: dict) -> str:
     return "\n\n".join(parts)
 
 
-def _revisions(stored):
-    names = [str(name)[:12] for name in stored["revisions"]]
+def _revisions(results):
+    names = [str(name)[:12] for name in results["revisions"]]
     return ("revision " if len(names) == 1 else "revisions ") + ", ".join(names)

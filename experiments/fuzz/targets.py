@@ -416,10 +416,10 @@ def _weights(folder):
     content = len(head).to_bytes(8, "little") + head + array.tobytes()
     (folder / "a.safetensors").write_bytes(content)
     (folder / "c.ckpt").write_bytes(pickle.dumps({"w": {"kernel": array}}))
-    pickled = io.BytesIO()
-    pickle.Pickler(pickled, 2).dump({"w": 1, "b": (1, 2)})
+    buffer = io.BytesIO()
+    pickle.Pickler(buffer, 2).dump({"w": 1, "b": (1, 2)})
     with zipfile.ZipFile(folder / "b.pth", "w") as archive:
-        archive.writestr("b/data.pkl", pickled.getvalue())
+        archive.writestr("b/data.pkl", buffer.getvalue())
         archive.writestr("b/data/0", array.tobytes())
 
 

@@ -61,19 +61,19 @@ def run(
                 progress.flush()
                 draw = random.Random(f"{seed}-{name}-{number}")
                 path = draw.choice(paths)
-                damaged = mutate.mutate(originals[path], path.name, draw)
-                path.write_bytes(damaged)
-                failure, spent = _read(target, work, counts)
+                mutation = mutate.mutate(originals[path], path.name, draw)
+                path.write_bytes(mutation)
+                failure, seconds = _read(target, work, counts)
                 growth = max(_peak(resource) - before, 0)
                 before += growth
-                counts["seconds"] = max(counts["seconds"], spent)
+                counts["seconds"] = max(counts["seconds"], seconds)
                 counts["bytes"] = max(counts["bytes"], growth)
-                if spent > MOST_SECONDS:
-                    failure = f"took {spent:.1f} s"
+                if seconds > MOST_SECONDS:
+                    failure = f"took {seconds:.1f} s"
                 elif growth > MOST_BYTES:
                     failure = f"grew by {growth / 2**20:.0f} MB"
                 if failure:
-                    _keep(folder, name, number, path, damaged, failure, counts)
+                    _keep(folder, name, number, path, mutation, failure, counts)
                 path.write_bytes(originals[path])
     return counts
 
@@ -115,13 +115,13 @@ def _place(error):
     return f"{pathlib.Path(ours[-1].filename).name}:{ours[-1].name}"
 
 
-def _keep(folder, name, number, path, damaged, failure, counts):
+def _keep(folder, name, number, path, mutation, failure, counts):
     same = [one for one in counts["failures"] if one["failure"] == failure]
     if len(same) < KEPT:
         failures = folder / "failures"
         failures.mkdir(exist_ok=True)
         label = "".join(c if c.isalnum() else "_" for c in f"{name}-{number}")
-        (failures / f"{label}-{path.name}").write_bytes(damaged)
+        (failures / f"{label}-{path.name}").write_bytes(mutation)
     counts["failures"].append({"number": number, "file": path.name, "failure": failure})
 
 

@@ -53,9 +53,9 @@ def main(args):
     with cli.user_errors():
         args.out.mkdir(parents=True, exist_ok=True)
         path = args.out / STORED
-    stored = records.rows(path)
+    results = records.rows(path)
     job = json.loads(SPEED.read_text())["job"]
-    stored |= {"job_seconds": job["seconds"], "train_seconds": job["train.seconds"]}
+    results |= {"job_seconds": job["seconds"], "train_seconds": job["train.seconds"]}
     for axis in args.axes:
         # A process for each axis, so that the memory of the last one is free.
         with concurrent.futures.ProcessPoolExecutor(
@@ -66,11 +66,11 @@ def main(args):
         ) as pool:
             for size in AXES[axis].sizes[: args.points]:
                 machine, record = pool.submit(_point, axis, size).result()
-                stored.setdefault("axes", {}).setdefault(axis, {})[str(size)] = record
-                records.write(path, stored, machine)
+                results.setdefault("axes", {}).setdefault(axis, {})[str(size)] = record
+                records.write(path, results, machine)
                 console.say(f"{axis} {size:,}: {record['cpu_seconds']:.3g} s a step")
     console.say(f"stored in {path}")
-    return stored
+    return results
 
 
 def _point(axis, size):

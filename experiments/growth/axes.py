@@ -55,12 +55,12 @@ def fit(points: Mapping[str, Mapping[str, Any]], name: str) -> Fit:
     if len(x) < 2 or not np.all(y > 0):
         return Fit(math.nan, math.nan, math.nan)
     x, y = np.log(x), np.log(y)
-    centered = x - x.mean()
-    exponent = float(centered @ y / (centered @ centered))
-    residual = y - y.mean() - exponent * centered
+    centered_x = x - x.mean()
+    exponent = float(centered_x @ y / (centered_x @ centered_x))
+    residual = y - y.mean() - exponent * centered_x
     error = math.nan
     if len(x) > 2:
         error = float(
-            np.sqrt(residual @ residual / (len(x) - 2) / (centered @ centered))
+            np.sqrt(residual @ residual / (len(x) - 2) / (centered_x @ centered_x))
         )
     return Fit(exponent, error, float(np.max(np.diff(y) / np.diff(x))))

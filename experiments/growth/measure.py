@@ -89,21 +89,21 @@ def _scene(preset, size=SMALL, frames=FEW, **fields):
     metadata = representation.metadata_of(capture, spec)
     model = representation.build(spec, metadata)
     state = (model.example or model.init)(capture, jax.random.key(0))
-    observed = evaluation.frames_of(capture, model.required_data)
-    take = np.arange(frames) % len(observed.times)
-    images = np.asarray(observed.images)
+    capture_frames = evaluation.frames_of(capture, model.required_data)
+    take = np.arange(frames) % len(capture_frames.times)
+    images = np.asarray(capture_frames.images)
     rows = np.arange(size[1]) * images.shape[1] // size[1]
     columns = np.arange(size[0]) * images.shape[2] // size[0]
     images = images[take][:, rows][:, :, columns]
-    resized = cameras.resize(observed.cameras, capture.size, size)
-    observed = observed._replace(
+    resized_cameras = cameras.resize(capture_frames.cameras, capture.size, size)
+    capture_frames = capture_frames._replace(
         images=jnp.asarray(images),
-        cameras=cameras.take(resized, take),
-        times=jnp.linspace(0, 1, frames, dtype=observed.times.dtype),
+        cameras=cameras.take(resized_cameras, take),
+        times=jnp.linspace(0, 1, frames, dtype=capture_frames.times.dtype),
         appearance=jnp.asarray(take.astype(np.int32)),
         valid=None,
     )
-    return Scene(spec, metadata, model, state, observed)
+    return Scene(spec, metadata, model, state, capture_frames)
 
 
 def _splats(count, **options):

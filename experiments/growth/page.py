@@ -27,16 +27,16 @@ A run has {STEPS:,} steps of one view, on one core. The clip has {CLIP_FRAMES:,}
 which are streamed from {CLIP_GB:.0f} GB on disk, and 10,000 Gaussians."""
 
 
-def page(stored: Mapping[str, Any]) -> str:
+def page(results: Mapping[str, Any]) -> str:
     """Format the exponents, the measurements and the limits of large scenes.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Markdown.
     """
-    axes = plotted(stored)
+    axes = collect_points(results)
     steepest = {
         name: fit(points, "cpu_seconds").steepest for name, points in axes.items()
     }
@@ -45,7 +45,7 @@ def page(stored: Mapping[str, Any]) -> str:
         f"Time grows fastest with {worst}: its exponent is at most "
         f"{markdown.number(steepest[worst])} between two sizes."
     ]
-    goals = _goals(stored, axes)
+    goals = _goals(results, axes)
     if goals:
         parts += ["## First limits of large scenes", GOALS, goals]
     parts += ["## Exponents", EXPONENTS, _exponents(axes)]
@@ -53,11 +53,13 @@ def page(stored: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def plotted(stored: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float]]]:
+def collect_points(
+    results: Mapping[str, Any],
+) -> dict[str, dict[str, dict[str, float]]]:
     """Return the measurements in the order of `AXES`, with the memory of a step.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Measurements by axis and size.
@@ -65,10 +67,10 @@ def plotted(stored: Mapping[str, Any]) -> dict[str, dict[str, dict[str, float]]]
     return {
         name: {
             size: point | {"memory": point["temporary_bytes"] + point["input_bytes"]}
-            for size, point in sorted(stored["axes"][name].items(), key=_size)
+            for size, point in sorted(results["axes"][name].items(), key=_size)
         }
         for name in AXES
-        if name in stored["axes"]
+        if name in results["axes"]
     }
 
 
@@ -113,11 +115,11 @@ def _measurements(axes):
     return markdown.table(heads, rows, words=1)
 
 
-def _goals(stored, axes):
+def _goals(results, axes):
     """Format what limits a long clip, many Gaussians and many captures."""
     clip = axes.get("pixels, 10,000 Gaussians", {}).get(str(CLIP_PIXELS))
     many = axes.get("Gaussians", {}).get("1000000")
-    available = stored["machine"]["memory_bytes"]
+    available = results["machine"]["memory_bytes"]
     rows = []
     if clip is not None:
         goal = "five minutes of 1920x1080"
@@ -125,34 +127,34 @@ def _goals(stored, axes):
     if many is not None:
         goal = "1,000,000 Gaussians, 352x264 pixels"
         rows.append(_goal(goal, many, many["memory"], available))
-    hours = CAPTURES * stored["job_seconds"] / 3600
+    hours = CAPTURES * results["job_seconds"] / 3600
     goal = f"{CAPTURES:,} captures with the default command"
-    share = stored["train_seconds"] / stored["job_seconds"]
+    share = results["train_seconds"] / results["job_seconds"]
     limit = f"time, of which training is {100 * share:.0f} %"
     rows.append([goal, limit, "", markdown.number(hours, 0), ""])
     heads = ("goal", "first limit", "s a step", "hours", "memory GB")
     return markdown.table(heads, rows, words=2)
 
 
-def _goal(goal, point, needed, available):
+def _goal(goal, point, memory_bytes, available):
     seconds = point["cpu_seconds"]
     limit = "time of a step"
-    if needed > available:
+    if memory_bytes > available:
         limit = f"memory: the measured machine has {available / 1e9:.0f} GB"
     return [
         goal,
         limit,
         markdown.short(seconds),
         markdown.number(seconds * STEPS / 3600, 0),
-        markdown.number(needed / 1e9, 1),
+        markdown.number(memory_bytes / 1e9, 1),
     ]
 
 
-def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
+def draw(results: Mapping[str, Any], path: pathlib.Path) -> None:
     """Plot time and memory over all sizes, each relative to the smallest.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
       path: The PNG file.
 
     Raises:
@@ -160,7 +162,7 @@ def draw(stored: Mapping[str, Any], path: pathlib.Path) -> None:
     """
     from nerfies_jax.visualization import figures
 
-    plotted_axes = plotted(stored)
+    plotted_axes = collect_points(results)
     figure = figures.new_figure(figsize=(8.4, 3.9), dpi=200, layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
     titles = {"cpu_seconds": "time of a step", "memory": "memory of a step"}

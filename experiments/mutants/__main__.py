@@ -21,7 +21,7 @@ import tempfile
 from experiments import cli, records
 from experiments.mutants.faults import ROOT, sample_faults
 from experiments.mutants.page import page
-from experiments.mutants.witnesses import default_tests, reached_by, tried
+from experiments.mutants.witnesses import default_tests, reached_by, try_fault
 from nerfies_jax.runtime import console
 
 
@@ -77,10 +77,12 @@ def main(args):
             finally:
                 copies.put(copy)
 
-        reached = _reach(args.out, workers, with_copy)
+        places_by_test = _reach(args.out, workers, with_copy)
         seconds = 60 * args.minutes
         tries = workers.map(
-            lambda fault: with_copy(lambda copy: tried(fault, copy, reached, seconds)),
+            lambda fault: with_copy(
+                lambda copy: try_fault(fault, copy, places_by_test, seconds)
+            ),
             remaining,
         )
         for row in tries:
@@ -103,22 +105,22 @@ def _reach(out, workers, with_copy):
         b"".join(sorted(map(_name_and_bytes, _files())))
     ).hexdigest()
     record = records.rows(path, reached=dict)
-    entered = record["reached"] if record.get("digest") == digest else {}
+    places_by_test = record["reached"] if record.get("digest") == digest else {}
 
     def run(test):
         return test, with_copy(lambda copy: reached_by(test, copy))
 
-    remaining = [test for test in default_tests(ROOT) if test not in entered]
+    remaining = [test for test in default_tests(ROOT) if test not in places_by_test]
     jobs = [workers.submit(run, test) for test in remaining]
     try:
         for job in concurrent.futures.as_completed(jobs):
             test, places = job.result()
-            entered[test] = places
-            write_json(path, {"digest": digest, "reached": entered})
+            places_by_test[test] = places
+            write_json(path, {"digest": digest, "reached": places_by_test})
     finally:
         for job in jobs:
             job.cancel()
-    return {test: set(places) for test, places in entered.items()}
+    return {test: set(places) for test, places in places_by_test.items()}
 
 
 def _name_and_bytes(name):

@@ -66,16 +66,17 @@ def places(path: str, source: str) -> list[Fault]:
     def at(line, column):
         return starts[line - 1] + column
 
-    changed = []
+    all_changes = []
     for function in ast.walk(ast.parse(source)):
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             marks = [function.lineno] + [d.lineno for d in function.decorator_list]
             for statement in function.body:
                 changes = _changes(statement, source.encode(), at)
-                changed += [(min(marks), *change) for change in changes]
+                all_changes += [(min(marks), *change) for change in changes]
     # Outer functions come first: what stands in an inner one is of that.
     unique = {
-        (start, end): (line, first, text) for first, line, start, end, text in changed
+        (start, end): (line, first, text)
+        for first, line, start, end, text in all_changes
     }
     return [
         Fault(path, line, first, *span, text)
@@ -107,8 +108,8 @@ def _changes(node, source, at):
         yield node.lineno, *span, new
     elif isinstance(node, ast.Call) and len(node.args) >= 2:
         first, second = node.args[-2:]
-        unpacked = any(isinstance(arg, ast.Starred) for arg in (first, second))
-        if not unpacked and not _in_any_order(node.func):
+        has_star = any(isinstance(arg, ast.Starred) for arg in (first, second))
+        if not has_star and not _in_any_order(node.func):
             one, other = _span(first, at), _span(second, at)
             between = source[one[1] : other[0]]
             text = source[slice(*other)] + between + source[slice(*one)]

@@ -14,16 +14,16 @@ SAME: dict[tuple[str, str], str] = {
 }
 
 
-def page(stored: dict) -> str:
+def page(results: dict) -> str:
     """Format the faults, the tests that notice each, and those that none notices."""
-    rows = stored["rows"]
+    rows = results["rows"]
     counts = collections.Counter(map(_fate, rows))
     faults = len(rows) - counts[HARMLESS]
     heads = ("file and line", "before", "after", "noticed by")
     table = markdown.table(heads, [_cells(row) for row in rows], words=4)
     share = 100 * counts[NOTICED] / max(faults, 1)
     seed = "No test was written because of these: so much of any faults is noticed."
-    if stored["seed"] == 0:
+    if results["seed"] == 0:
         seed = "Core was strengthened until it noticed most of these."
     same = f"; {counts[HARMLESS]} more change no result" if counts[HARMLESS] else ""
     return (

@@ -9,11 +9,11 @@ import types
 
 from experiments.mutants.faults import PACKAGES, ROOT
 
-_entered: set[types.CodeType] = set()
+_codes: set[types.CodeType] = set()
 
 
 def _note(frame, _event, _argument):
-    _entered.add(frame.f_code)  # no local tracer comes back: lines are not told
+    _codes.add(frame.f_code)  # no local tracer comes back: lines are not told
 
 
 def pytest_configure():
@@ -26,10 +26,10 @@ def pytest_unconfigure():
     """Write those of the packages as "file:line" of where they begin."""
     sys.settrace(None)
     threading.settrace(None)
-    entered = set()
-    for code in _entered:
+    functions = set()
+    for code in _codes:
         path = pathlib.Path(code.co_filename)
         if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in PACKAGES:
-            entered.add(f"{path.relative_to(ROOT)}:{code.co_firstlineno}")
+            functions.add(f"{path.relative_to(ROOT)}:{code.co_firstlineno}")
     answer = pathlib.Path(os.environ["MUTANTS_REACHED"])
-    answer.write_text(json.dumps(sorted(entered)))
+    answer.write_text(json.dumps(sorted(functions)))

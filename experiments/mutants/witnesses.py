@@ -42,15 +42,18 @@ def reached_by(test: str, copy: pathlib.Path) -> list[str]:
     return json.loads(answer.read_text())
 
 
-def tried(
-    fault: Fault, copy: pathlib.Path, reached: dict[str, set[str]], seconds: float
+def try_fault(
+    fault: Fault,
+    copy: pathlib.Path,
+    places_by_test: dict[str, set[str]],
+    seconds: float,
 ) -> dict:
     """Plant a fault, and return it with up to three tests that notice it."""
     path = copy / fault.path
     right = path.read_bytes()
     wrong = right[: fault.start] + fault.text.encode() + right[fault.end :]
     began = time.monotonic()
-    tests = _tests_that_enter(fault, reached)
+    tests = _tests_that_enter(fault, places_by_test)
     path.write_bytes(wrong)
     try:
         caught_by = _failures(tests, copy, seconds) if tests else []
@@ -71,11 +74,13 @@ def _line(source, line):
     return source.decode().splitlines()[line - 1].strip()
 
 
-def _tests_that_enter(fault: Fault, reached: dict[str, set[str]]) -> list[str]:
+def _tests_that_enter(fault: Fault, places_by_test: dict[str, set[str]]) -> list[str]:
     """Files of tests that enter the function, those named after its module first."""
     test_name = f"test_{pathlib.Path(fault.path).stem.strip('_')}"
     place = f"{fault.path}:{fault.function}"
-    entering = sorted(test for test, places in reached.items() if place in places)
+    entering = sorted(
+        test for test, places in places_by_test.items() if place in places
+    )
     entering.sort(key=lambda test: not pathlib.Path(test).name.startswith(test_name))
     return entering
 

@@ -59,7 +59,7 @@ class OnDevice:
     def __post_init__(self):
         cli.check_presets(self.presets)
         for case in self.cases:
-            raster.parsed(case)
+            raster.parse_case(case)
         if not self.minutes > 0:
             raise ValueError(f"--minutes {self.minutes} must be positive")
 
@@ -70,18 +70,18 @@ def main(args):
     with cli.user_errors():
         args.out.mkdir(parents=True, exist_ok=True)
         path = args.out / STORED
-        stored = records.rows(path)
+        results = records.rows(path)
         for part, name in _work(args):
             console.say(f"{part} {name} ...")
-            record = _tests(args) if part == "tests" else _measured(args, part, name)
+            record = _tests(args) if part == "tests" else _measure(args, part, name)
             machine = record.pop("machine", None)
-            stored.setdefault(part, {})[name] = record
+            results.setdefault(part, {})[name] = record
             if record["failure"]:
                 console.say(f"{part} {name} failed: {record['failure']}")
-            records.write(path, stored, *([machine] if machine else []))
-            (args.out / PAGE).write_text(f"# On one device\n\n{page.page(stored)}\n")
+            records.write(path, results, *([machine] if machine else []))
+            (args.out / PAGE).write_text(f"# On one device\n\n{page.page(results)}\n")
     console.say(f"stored in {path} and {args.out / PAGE}")
-    return stored
+    return results
 
 
 def _work(args):
@@ -98,12 +98,12 @@ def _work(args):
     ]
 
 
-def _measured(args, part, name):
+def _measure(args, part, name):
     """Return what a process measured, or the reason why it did not."""
     result = (args.out / "part.json").absolute()
     result.unlink(missing_ok=True)
     words = ["experiments.on_device.worker", part, name, args.device, str(result)]
-    record = _limited(args, words, f"{part}.log")
+    record = _run_limited(args, words, f"{part}.log")
     if not record["failure"]:
         record |= records.one(result, {}) or {"failure": "it left no result"}
     result.unlink(missing_ok=True)
@@ -117,23 +117,23 @@ def _tests(args):
     report = (args.out / "tests.xml").absolute()
     report.unlink(missing_ok=True)
     words = ["pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={report}"]
-    record = _limited(args, [*words, *args.tests], "tests.log")
+    record = _run_limited(args, [*words, *args.tests], "tests.log")
     if not report.exists():
         return record
     counts = dict.fromkeys(("passed", "failed", "skipped"), 0)
-    failed = []
+    failed_tests = []
     for case in ET.parse(report).iter("testcase"):
         outcome = {child.tag for child in case}
         if outcome & {"failure", "error"}:
             counts["failed"] += 1
-            failed.append(f"{case.get('classname')}.{case.get('name')}")
+            failed_tests.append(f"{case.get('classname')}.{case.get('name')}")
         else:
             counts["skipped" if "skipped" in outcome else "passed"] += 1
     # Failed tests are a result.
-    return record | counts | {"failure": "", "failed_tests": failed[:LISTED]}
+    return record | counts | {"failure": "", "failed_tests": failed_tests[:LISTED]}
 
 
-def _limited(args, words, log):
+def _run_limited(args, words, log):
     """Run a Python module within the time limit, and kill it with all its children."""
     import psutil
 

@@ -13,22 +13,22 @@ The mean of a training step over the phases of a run on the built-in scene (176x
 from its initial state. *Compile* is the training program, without a cache."""
 
 
-def page(stored: Mapping[str, Any]) -> str:
+def page(results: Mapping[str, Any]) -> str:
     """Format the results of all parts that were run.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Markdown.
     """
-    machine = stored.get("machine", {})
+    machine = results.get("machine", {})
     device = machine.get("device", "unknown")
     parts = [f"The device is **{device}** ({machine.get('backend', 'unknown')})."]
     for part, write in SECTIONS.items():
-        if part in stored:
-            good = {k: x for k, x in stored[part].items() if not x["failure"]}
-            bad = {k: x for k, x in stored[part].items() if x["failure"]}
+        if part in results:
+            good = {k: x for k, x in results[part].items() if not x["failure"]}
+            bad = {k: x for k, x in results[part].items() if x["failure"]}
             parts += write(good) if good else [f"## {TITLES[part]}"]
             lines = [
                 f"{k} failed: {' '.join(x['failure'].split())}" for k, x in bad.items()
@@ -48,16 +48,16 @@ TITLES = {
 def _raster(rows):
     heads = ("Gaussians@image", "forward ms", "forward and backward ms", "peak MB")
     names = ("forward_ms", "forward_backward_ms", "device_peak_mb")
-    return _tabled("raster", RASTER, heads, names, rows)
+    return _format_table("raster", RASTER, heads, names, rows)
 
 
 def _steps(rows):
     heads = ("preset", "step ms", "compile s", "devices", "peak MB")
     names = ("step_ms", "compile_seconds", "devices", "device_peak_mb")
-    return _tabled("steps", STEPS, heads, names, rows)
+    return _format_table("steps", STEPS, heads, names, rows)
 
 
-def _tabled(part, text, heads, names, rows):
+def _format_table(part, text, heads, names, rows):
     cells = [
         [f"`{key}`", *(markdown.short(row.get(name)) for name in names)]
         for key, row in rows.items()

@@ -30,8 +30,8 @@ def measure(part: str, name: str, device: platform.Device) -> dict[str, Any]:
     platform.start_jax(device, "one")
     from nerfies_jax.metrics import clock
 
-    forward, with_gradient = raster.compiled(
-        name, raster.make_scene(*raster.parsed(name))
+    forward, with_gradient = raster.compile_case(
+        name, raster.make_scene(*raster.parse_case(name))
     )
     # Wall-clock time: the processor only waits for an accelerator.
     record: dict[str, Any] = {

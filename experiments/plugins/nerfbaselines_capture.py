@@ -116,9 +116,9 @@ def world_cameras(cameras: Any) -> Camera:
             f"{is_fisheye.sum()} of {count} cameras are fisheyes; undistort the images "
             "of those"
         )
-    stored = np.reshape(cameras.distortion_parameters, (count, -1))
+    parameters = np.reshape(cameras.distortion_parameters, (count, -1))
     lens = np.zeros((count, 6), np.float32)  # k1 k2 p1 p2 k3 k4
-    lens[:, : min(stored.shape[1], 6)] = stored[:, :6]
+    lens[:, : min(parameters.shape[1], 6)] = parameters[:, :6]
     lens[models == 0] = 0
     radial = np.zeros((count, 3), np.float32)
     if not is_fisheye.any():
@@ -223,8 +223,8 @@ def load_cameras(path: pathlib.Path) -> Capture:
     Returns:
       The capture, with black images.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        arrays = dict(stored)
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
 
     def group(kind: Any, prefix: str) -> Any:
         names: Sequence[str] = kind._fields

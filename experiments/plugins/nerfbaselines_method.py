@@ -58,13 +58,14 @@ class NerfiesJax:
         about = None
         if self._checkpoint is not None:
             about = json.loads((self._checkpoint / SETTINGS).read_text())
-            stored = about["settings"]
-            if settings and settings != stored:
+            checkpoint_settings = about["settings"]
+            if settings and settings != checkpoint_settings:
                 raise ValueError(
-                    f"{checkpoint} was made with the settings {stored}, but these are "
-                    f"{settings}; leave them out, or train a new model"
+                    f"{checkpoint} was made with the settings "
+                    f"{checkpoint_settings}, but these are {settings}; leave "
+                    "them out, or train a new model"
                 )
-            settings = stored
+            settings = checkpoint_settings
         elif train_dataset is None:
             raise ValueError("pass a checkpoint, a train_dataset, or both")
         self._settings = settings

@@ -90,7 +90,7 @@ class Raster(_Stored):
 
     def __post_init__(self):
         for case in self.cases:
-            raster.parsed(case)
+            raster.parse_case(case)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,9 +163,9 @@ def keep(
 
 def _apart(work, *arguments):
     """Return the work's result from a fresh process."""
-    spawned = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(
-        1, spawned, children.end_with_parent, (os.getpid(),)
+        1, context, children.end_with_parent, (os.getpid(),)
     ) as pool:
         return pool.submit(work, *arguments).result()
 

@@ -121,9 +121,9 @@ def measure_all(args: Any, path: pathlib.Path) -> pathlib.Path:
     tables = {name: variants_of(name, args) for name in presets}
     metrics: list[Metric] = []
     for name, variants in tables.items():
-        measured = measure(name, variants, args.at, args.repeats)
-        console.say("\n".join(effects_page.tables({x.key: x for x in measured})))
-        metrics += measured
+        preset_metrics = measure(name, variants, args.at, args.repeats)
+        console.say("\n".join(effects_page.tables({x.key: x for x in preset_metrics})))
+        metrics += preset_metrics
     about = {
         "presets": list(presets),
         "at": args.at,
@@ -213,9 +213,15 @@ def without(spec: Any, names: tuple[str, ...]) -> Any:
     Returns:
       The other settings.
     """
-    removed = set(names)
-    removed |= {name for name, needed in NEEDS.items() if removed & {*needed}}
-    return dataclasses.replace(spec, **dict.fromkeys(removed & {*effects_in(spec)}))
+    removed_names = set(names)
+    removed_names |= {
+        name
+        for name, required_names in NEEDS.items()
+        if removed_names & {*required_names}
+    }
+    return dataclasses.replace(
+        spec, **dict.fromkeys(removed_names & {*effects_in(spec)})
+    )
 
 
 def variants(spec: Any, parts: Mapping[str, Any]) -> list[Variant]:
@@ -243,9 +249,9 @@ def variants(spec: Any, parts: Mapping[str, Any]) -> list[Variant]:
 
     scenes = [Variant("bare", only())]
     for name in names:
-        needed = tuple(x for x in NEEDS.get(name, ()) if x in names)
-        title = f"{needed[0]} + {name}" if needed else f"only {name}"
-        scenes.append(Variant(title, only(name, *needed)))
+        required_names = tuple(x for x in NEEDS.get(name, ()) if x in names)
+        title = f"{required_names[0]} + {name}" if required_names else f"only {name}"
+        scenes.append(Variant(title, only(name, *required_names)))
     if len(names) > 1:  # the only one is the whole scene
         scenes.append(Variant("all", spec))
         parts = {name: without(spec, (name,)) for name in names} | dict(parts)
@@ -270,35 +276,37 @@ def measure(
     capture = runs.read_capture(CaptureSource())
     # "without" the only effect is "bare": the same scene under several names.
     first = {scene.spec: scene.name for scene in reversed(scenes)}
-    compiled = {spec: _compile(representation, capture, spec, at) for spec in first}
+    scene_programs = {
+        spec: _compile(representation, capture, spec, at) for spec in first
+    }
     calls = {
         f"{first[spec]} {name}": program.call
-        for spec, (_, programs) in compiled.items()
+        for spec, (_, programs) in scene_programs.items()
         for name, program in programs.items()
     }
     timings = clock.compare(calls, repeats=repeats, warm_up=1)
 
     def seconds(spec, name):
         timing = timings[f"{first[spec]} {name}"]
-        return timing.median_cpu / compiled[spec][1][name].steps
+        return timing.median_cpu / scene_programs[spec][1][name].steps
 
     metrics = []
     for scene in scenes:
-        parameters, programs = compiled[scene.spec]
+        parameters, programs = scene_programs[scene.spec]
         stem = f"{preset}.{scene.name.replace(' + ', '_and_').replace(' ', '_')}"
         metrics.append(Metric(f"{stem}.parameters", parameters, "numbers", "lower"))
         for name, program in programs.items():
             numbers = program.numbers | {"seconds": seconds(scene.spec, name)}
             for key, unit, share in NUMBERS:
                 value = numbers[key]
-                allowed = share * value if math.isfinite(value) else 0.0
+                tolerance = share * value if math.isfinite(value) else 0.0
                 metrics.append(
-                    Metric(f"{stem}.{name}.{key}", value, unit, "lower", allowed)
+                    Metric(f"{stem}.{name}.{key}", value, unit, "lower", tolerance)
                 )
             ratio = numbers["seconds"] / seconds(scenes[0].spec, name)
-            allowed = RATIO_TOLERANCE * ratio
+            tolerance = RATIO_TOLERANCE * ratio
             key = f"{stem}.{name}.over_bare"
-            metrics.append(Metric(key, ratio, "", "lower", allowed))
+            metrics.append(Metric(key, ratio, "", "lower", tolerance))
     return metrics
 
 
@@ -327,12 +335,12 @@ def _compile(representation, capture, spec, at):
         return chunk.scan_steps(model.step, state, frames, chunk.LENGTH)
 
     programs = {}
-    for name, once, called, count in (
+    for name, once, function, count in (
         ("loss", loss, loss, 1),
         ("step", model.step, steps, chunk.LENGTH),
     ):
         began = time.process_time()
-        program = jax.jit(called).lower(state, frames).compile()
+        program = jax.jit(function).lower(state, frames).compile()
         cost = clock.cost_of(program, time.process_time() - began)._asdict()
         products = matrix_flops.count(once, state, frames)
         numbers = cost | {"matrix_flops": products.flops}

@@ -85,17 +85,17 @@ HEADS = (
 MILLIONS = ("flops", "matrix_flops", "bytes_accessed", "temporary_bytes")
 
 
-def page(stored) -> str:
+def page(results) -> str:
     """Format the page below the docstring.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Markdown.
     """
-    about, rows = stored["about"], stored["metrics"]
-    quoted = {
+    about, rows = results["about"], results["metrics"]
+    ratios = {
         name: rows[f"{key}.step.over_bare"]["value"] for name, key in QUOTED.items()
     }
     metrics = {
@@ -109,7 +109,7 @@ def page(stored) -> str:
                 stored=STORED,
                 apart=_apart(about),
             ),
-            SUMMARY.format(**quoted),
+            SUMMARY.format(**ratios),
             "\n".join(tables(metrics)),
         ]
     )
@@ -169,6 +169,6 @@ def _apart(about):
     if not apart:
         return ""
     cpus = " and ".join(sorted(set(apart.values())))
-    named = ", ".join(f"`{name}`" for name in apart)
-    line = f"Measured apart, on {cpus}: {named}."
+    preset_names = ", ".join(f"`{name}`" for name in apart)
+    line = f"Measured apart, on {cpus}: {preset_names}."
     return "\n" + textwrap.fill(line, 88, break_on_hyphens=False)

@@ -23,26 +23,26 @@ Parts may exceed the step, because parts of fields are measured with all rays at
 once."""
 
 
-def page(stored: Mapping[str, Any]) -> str:
+def page(results: Mapping[str, Any]) -> str:
     """Format the tables of presets, the default command and the rasterizer.
 
     Args:
-      stored: The stored results.
+      results: The stored results.
 
     Returns:
       Markdown.
     """
-    parts = [READING, _presets(stored["presets"]), "## Where a step's time goes"]
+    parts = [READING, _presets(results["presets"]), "## Where a step's time goes"]
     parts.append(PARTS)
-    parts.append(_parts(stored["presets"]))
-    if "job" in stored:
-        parts += ["## The default command", _job(stored["job"])]
-        if "jobs" in stored:
-            jobs = (stored["jobs"][name] for name in ("first", "beside", "again"))
+    parts.append(_parts(results["presets"]))
+    if "job" in results:
+        parts += ["## The default command", _job(results["job"])]
+        if "jobs" in results:
+            jobs = (results["jobs"][name] for name in ("first", "beside", "again"))
             parts.append(_comparison(*jobs))
-    if "raster" in stored:
+    if "raster" in results:
         parts += ["## The rasterizer compared with a tuned C++ one", RASTER]
-        parts.append(_raster(stored["raster"]["rows"]))
+        parts.append(_raster(results["raster"]["rows"]))
     return "\n\n".join(parts)
 
 

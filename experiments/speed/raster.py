@@ -40,7 +40,7 @@ def measure(cases: tuple[str, ...], reference: pathlib.Path | None) -> dict:
     return {"machine": clock.machine(), "rows": rows}
 
 
-def parsed(case: str) -> tuple[int, int, int]:
+def parse_case(case: str) -> tuple[int, int, int]:
     """Parse a case such as 10000@256x256.
 
     Returns:
@@ -59,7 +59,7 @@ def parsed(case: str) -> tuple[int, int, int]:
         ) from None
 
 
-def compiled(text: str, scene: dict) -> tuple:
+def compile_case(text: str, scene: dict) -> tuple:
     """Compile the rasterizer and its gradient for a scene.
 
     Args:
@@ -77,7 +77,7 @@ def compiled(text: str, scene: dict) -> tuple:
 
     # The clamp of the other rasterizer.
     spec = dataclasses.replace(GSPLAT, alpha_max=0.999)
-    size = parsed(text)[1:]
+    size = parse_case(text)[1:]
     footprints = _footprints_of(scene, spec.alpha_threshold)
     colors = jnp.asarray(scene["colors"], jnp.float32)
 
@@ -86,10 +86,10 @@ def compiled(text: str, scene: dict) -> tuple:
         return raster.rasterize(footprints, colors, size, spec)
 
     def loss(mean_px, whitening, opacity, colors, footprints):
-        displaced = footprints._replace(
+        new_footprints = footprints._replace(
             mean_px=mean_px, whitening=whitening, opacity=opacity
         )
-        image, transmittance = raster.rasterize(displaced, colors, size, spec)
+        image, transmittance = raster.rasterize(new_footprints, colors, size, spec)
         return jnp.sum(image) + jnp.sum(transmittance)
 
     gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))
@@ -106,7 +106,7 @@ def make_scene(count: int, width: int, height: int) -> dict:
     rng = np.random.default_rng(0)
     size = np.array([width, height])
     center = rng.random((4, 2))[rng.integers(0, 4, count)] * size
-    clustered = center + rng.normal(size=(count, 2)) * size * 0.06
+    cluster_samples = center + rng.normal(size=(count, 2)) * size * 0.06
     spread = rng.random((count, 2)) * size
     one, two = np.exp(rng.normal(0.3, 0.5, (2, count))) ** 2
     angle = rng.random(count) * np.pi
@@ -117,7 +117,7 @@ def make_scene(count: int, width: int, height: int) -> dict:
         sin**2 * one + cos**2 * two + 0.3,
     ]
     return dict(
-        means2d=np.where(rng.random((count, 1)) < 0.5, spread, clustered),
+        means2d=np.where(rng.random((count, 1)) < 0.5, spread, cluster_samples),
         covs=np.stack(covariance, 1),
         depths=1 + 9 * rng.random(count),
         opacities=1 / (1 + np.exp(-2 * rng.normal(size=count))),
@@ -186,14 +186,14 @@ def time_case(text: str, reference: pathlib.Path | None) -> dict:
     """Time one case, between two runs of the other rasterizer where there is one."""
     import numpy as np
 
-    theirs, scene = [], make_scene(*parsed(text))
+    theirs, scene = [], make_scene(*parse_case(text))
     if reference is not None:
         with tempfile.TemporaryDirectory() as folder:
             file = str(pathlib.Path(folder) / "scene.npz")
             theirs.append(_reference_times(reference, text, file))
             with np.load(file) as arrays:
                 scene = {name: arrays[name] for name in arrays.files}
-    forward, with_gradient = compiled(text, scene)
+    forward, with_gradient = compile_case(text, scene)
     row: dict[str, Any] = {
         "case": text,
         "forward_ms": median_ms(forward),

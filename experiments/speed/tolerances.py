@@ -16,9 +16,9 @@ OF_PRESETS = {
 DECIBELS = {"heldout.psnr": 0.5, "heldout.moving_psnr": 1.0}  # four deviations
 
 
-def metrics(stored: Mapping[str, Any]) -> list[Metric]:
+def metrics(results: Mapping[str, Any]) -> list[Metric]:
     """Collect step times of presets, ratios of the rasterizer, and the main job."""
-    return [*_presets(stored.get("presets", {})), *_raster(stored), *_job(stored)]
+    return [*_presets(results.get("presets", {})), *_raster(results), *_job(results)]
 
 
 def _within(key, value, unit, share) -> Metric:
@@ -33,16 +33,16 @@ def _presets(presets) -> Iterator[Metric]:
                     yield _within(f"{preset}.{which}.{name}", record[name], unit, share)
 
 
-def _raster(stored) -> Iterator[Metric]:
-    for row in stored.get("raster", {}).get("rows", ()):
+def _raster(results) -> Iterator[Metric]:
+    for row in results.get("raster", {}).get("rows", ()):
         if "ratio" in row:
             yield _within(f"raster.{row['case']}.ratio", row["ratio"], "", RATIO)
 
 
-def _job(stored) -> Iterator[Metric]:
-    if "job" not in stored:
+def _job(results) -> Iterator[Metric]:
+    if "job" not in results:
         return
-    job = stored["job"]
+    job = results["job"]
     yield _within("job.seconds", job["seconds"], "s", TIMES)
     for name, tolerance in DECIBELS.items():
         if job.get(name) is not None:  # where nothing moves

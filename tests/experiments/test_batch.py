@@ -42,7 +42,7 @@ def planned(folder, *names):
     args = cli.parse(
         batch.Batch, [*captures(folder, *names), "--out", str(folder / "out")]
     )
-    tasks = [vars(each.task) for each in batch.planned(args)]
+    tasks = [vars(each.task) for each in batch.plan_runs(args)]
     return [StandIn(**fields) for fields in tasks]
 
 

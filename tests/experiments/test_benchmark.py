@@ -47,7 +47,7 @@ def test_a_benchmark_is_named_without_where_it_lies(tmp_path):
     words = [str(tmp_path / "capture"), "--max-side", "256", "--steps", "20"]
     args = cli.parse(benchmark.Benchmark, words)
     assert args.label == "capture --max-side 256 --steps 20"
-    planned = benchmark.planned(args)
+    planned = benchmark.plan_runs(args)
     folders = [run.task.folder for run in planned]
     assert [folder.name for folder in folders] == [f"default-{k}" for k in range(3)]
     assert folders[0].parent.name == "capture-max-side-256-steps-20"
@@ -56,7 +56,7 @@ def test_a_benchmark_is_named_without_where_it_lies(tmp_path):
 def test_a_run_is_one_of_reconstruct():
     words = "--scene fast --suite sonata --methods no-depth --set sh_degree=0"
     args = cli.parse(benchmark.Benchmark, [*words.split(), "--seconds", "9"])
-    first = benchmark.planned(args)[0].task
+    first = benchmark.plan_runs(args)[0].task
     changes = ("depth=none", suites.TRACKS, "sh_degree=0")
     assert first.words == (
         *("--scene", "fast", "--seed", "0", "--preset", "sonata-small"),
@@ -69,13 +69,13 @@ def test_methods_over_time_are_evaluated_at_halves_of_their_own_steps():
     words = ["--suite", "curves", "--methods", "static", "moba", "--seeds", "1"]
     for more, steps in ([], suites.CURVES.steps), (["--steps", "20"], {"static": 20}):
         args = cli.parse(benchmark.Benchmark, words + more)
-        line = " ".join(benchmark.planned(args)[0].task.words)
+        line = " ".join(benchmark.plan_runs(args)[0].task.words)
         count = steps["static"]
         points = [count // 16, count // 8, count // 4, count // 2, count]
         shown = " ".join(map(str, points))
         assert f"--steps {count} --evaluate-at {shown}" in line
     timed = cli.parse(benchmark.Benchmark, [*words, "--seconds", "9"])
-    assert "--evaluate-at" not in benchmark.planned(timed)[0].task.words
+    assert "--evaluate-at" not in benchmark.plan_runs(timed)[0].task.words
 
 
 def test_a_method_says_if_its_preset_has_changed_since():
@@ -128,7 +128,7 @@ def test_interrupted_runs_continue_and_finished_ones_are_not_repeated(
     words = ("--scene", "fast", "--preset", "nerf-small", "--seconds", "9")
     out = ("--jobs", "2", "--out", tmp_path / "out")
     args = cli.parse(benchmark.Benchmark, [*words, "--out", str(tmp_path / "out")])
-    first, second, _ = (run.task for run in benchmark.planned(args))
+    first, second, _ = (run.task for run in benchmark.plan_runs(args))
     first.folder.mkdir(parents=True)
     (first.folder / "config.json").write_text("{}")
     assert run(*words, *out) == 0
@@ -263,7 +263,7 @@ def test_methods_that_are_measured_again_replace_only_themselves():
         "methods": {"a": {"mean": 4, "revision": "new"}},
         "claims": [],
     }
-    merged = verdicts.merged({"one": old, "other": old}, {"one": new, "third": new})
+    merged = verdicts.merge({"one": old, "other": old}, {"one": new, "third": new})
     assert list(merged) == ["one", "other", "third"]
     assert merged["other"] == old
     one = merged["one"]
@@ -277,7 +277,7 @@ def test_methods_that_are_measured_again_replace_only_themselves():
 def test_suites_are_consistent(name):
     suite = SUITES[name]
     for settings in suite.methods.values():
-        preset, changes = suites.parsed(settings)
+        preset, changes = suites.parse_settings(settings)
         specs.override(representations.of_preset(preset).presets[preset], changes)
     for claim in suite.claims:
         assert {claim.better, claim.worse} <= set(suite.methods)

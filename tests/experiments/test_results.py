@@ -42,7 +42,9 @@ def test_presets_are_ranked_by_the_kept_curves():
 def test_the_figure_of_growth_shows_the_kept_numbers():
     stored = json.loads(results.path_of("growth").read_text())
     with PIL.Image.open(PAGES / "growth.png") as image:
-        assert image.text[figures.DIGEST] == figures.digest(growth.plotted(stored))
+        assert image.text[figures.DIGEST] == figures.digest(
+            growth.collect_points(stored)
+        )
 
 
 def test_the_index_lists_every_page_there_is():
