@@ -12,16 +12,16 @@ SUFFIXES |= {"mesh": ".ply"}
 def _gaussians(args: Any, run: Any) -> str:
     from gaussians_jax.core import splats
     from gaussians_jax.core.splats import Splats
-    from gaussians_jax.io import files, instants, sampled, turned
+    from gaussians_jax.io import files, keyframes, single_time, turned
     from nerfies_jax import runs
     from nerfies_jax.capture import axes
 
     state = runs.restore(args.run, run).state
-    in_scene = instants.splats_at(run.model, state)
+    in_scene = single_time.splats_at(run.model, state)
     rotation = None if args.axis is None else axes.rotation_to(run.capture, args.axis)
     visible = None
     if args.selection == "seen":
-        visible = sampled.visible(_visible_statistics(run, state))
+        visible = keyframes.visible(_visible_statistics(run, state))
         left_out = splats.active_count(run.model.stages.rows(state.params))
         left_out -= int(visible.sum())
 
@@ -30,7 +30,7 @@ def _gaussians(args: Any, run: Any) -> str:
         if visible is not None:
             rows = Splats(*(leaf[visible] for leaf in rows))
         if args.units == "world":
-            rows = instants.in_world(rows, run.capture)
+            rows = single_time.in_world(rows, run.capture)
         return rows if rotation is None else turned.turned(rows, rotation)
 
     save = functools.partial(files.save, usd_up="Z" if args.axis == "z" else "Y")
@@ -39,7 +39,7 @@ def _gaussians(args: Any, run: Any) -> str:
         summary = f"{count} Gaussians at time {args.time or 0:g}"
     else:
         suffix = SUFFIXES.get(args.kind, f".{args.kind}")
-        instants.save_sequence(
+        single_time.save_sequence(
             args.place, at, args.frames, suffix, save, overwrite=args.overwrite
         )
         summary = f"Gaussians at {args.frames} times"
@@ -53,14 +53,14 @@ def _gaussians(args: Any, run: Any) -> str:
 def _visible_statistics(run: Any, state: Any) -> Any:
     """Return what the training cameras saw of each Gaussian."""
     from gaussians_jax.core import splats
-    from gaussians_jax.io import instants, sampled
+    from gaussians_jax.io import keyframes, single_time
     from gaussians_jax.scene.spec import raster_of
 
-    at = instants.gaussians_at(run.model, state)
+    at = single_time.gaussians_at(run.model, state)
     rows = run.model.stages.rows(state.params)
     degree = splats.active_degree(state.step, run.spec.sh_every, run.spec.sh_degree)
     raster = raster_of(run.spec, run.metadata)
-    return sampled.seen_in_training(at, rows, raster, degree, run.capture)
+    return keyframes.measure_contributions(at, rows, raster, degree, run.capture)
 
 
 def _mesh(args: Any, run: Any) -> str:
@@ -94,16 +94,16 @@ def _mesh(args: Any, run: Any) -> str:
 
 
 def _splatv(args: Any, run: Any) -> str:
-    from gaussians_jax.io import instants, sampled, splatv
+    from gaussians_jax.io import keyframes, single_time, splatv
     from gaussians_jax.scene.spec import raster_of
     from nerfies_jax import evaluation, runs
 
     state, spec, capture = runs.restore(args.run, run).state, run.spec, run.capture
-    at = instants.gaussians_at(run.model, state)
+    at = single_time.gaussians_at(run.model, state)
     rows = run.model.stages.rows(state.params)
     raster = raster_of(spec, run.metadata)
     visible = _visible_statistics(run, state)
-    samples = sampled.gathered(at, rows, visible, sampled.MOST_INSTANTS)
+    samples = keyframes.sample(at, rows, visible, keyframes.MOST_KEYFRAMES)
     curves = splatv.write(args.place, samples, capture)
     model = run.model
     # The file has no exposures and no appearances.

@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments.plugins import nerfbaselines_capture as conversion
 from gaussians_jax.core import splats
-from gaussians_jax.io import instants
+from gaussians_jax.io import single_time
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.evaluation import Renderer, frames_of
 from nerfies_jax.geometry import camera
@@ -255,9 +255,9 @@ class NerfiesJax:
         if self._model.stages is None:
             name = self._config.preset_name
             raise NotImplementedError(f"preset {name} has no Gaussians")
-        rows = instants.splats_at(self._model, self._state)(0.0)
+        rows = single_time.splats_at(self._model, self._state)(0.0)
         active = np.asarray(splats.active_mask(rows))
-        rows = instants.in_world(rows, self._capture)
+        rows = single_time.in_world(rows, self._capture)
         rows = jax.tree.map(lambda leaf: np.asarray(leaf)[active], rows)
         harmonics = np.concatenate([rows.sh_dc, rows.sh_rest], axis=1)
         return {

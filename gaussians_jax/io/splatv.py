@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gaussians_jax.core.splats import Gaussians
-from gaussians_jax.io.sampled import Instants
+from gaussians_jax.io.keyframes import Keyframes
 from gaussians_jax.splatting import rendering
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax import evaluation
@@ -79,22 +79,22 @@ class Fit(NamedTuple):
     views: int
 
 
-def fit(instants: Instants) -> Curves:
+def fit(keyframes: Keyframes) -> Curves:
     """Fit curves to Gaussians at evenly spaced times by least squares.
 
     Args:
-      instants: Gaussians at evenly spaced times. Faint ones have less weight.
+      keyframes: Gaussians at evenly spaced times. Faint ones have less weight.
 
     Returns:
       The curves.
     """
-    times = np.linspace(0, 1, len(instants.mean))
-    opacity, center, width = _bells(times, instants.opacity.astype(np.float64))
+    times = np.linspace(0, 1, len(keyframes.mean))
+    opacity, center, width = _bells(times, keyframes.opacity.astype(np.float64))
     time_offset = times - 0.5
-    weight = instants.opacity.astype(np.float64) + FAINTEST
-    means = instants.mean.astype(np.float64)
+    weight = keyframes.opacity.astype(np.float64) + FAINTEST
+    means = keyframes.mean.astype(np.float64)
     position = _polynomials(time_offset, weight, means, 4)
-    turn = _polynomials(time_offset, weight, instants.quaternion.astype(np.float64), 2)
+    turn = _polynomials(time_offset, weight, keyframes.quaternion.astype(np.float64), 2)
     # Change of variables from the time since the middle to the time since the center.
     shift = (center - 0.5)[:, None]
     a, b, c, d = np.moveaxis(position, 1, 0)
@@ -104,8 +104,8 @@ def fit(instants: Instants) -> Curves:
         motion=motion,
         quaternion=turn[:, 0] + shift * turn[:, 1],
         turning=turn[:, 1],
-        scale=np.exp(instants.log_scale.astype(np.float64).mean(axis=0)),
-        color=np.clip(instants.color, 0, 1).astype(np.float64),
+        scale=np.exp(keyframes.log_scale.astype(np.float64).mean(axis=0)),
+        color=np.clip(keyframes.color, 0, 1).astype(np.float64),
         opacity=opacity,
         center=center,
         width=width,
@@ -245,18 +245,18 @@ def decode(data: bytes) -> Curves:
     return Curves._make((*parts, rgba[:, :3], rgba[:, 3], bell[:, 0], bell[:, 1]))
 
 
-def write(path: pathlib.Path, instants: Instants, capture: Capture) -> Curves:
+def write(path: pathlib.Path, keyframes: Keyframes, capture: Capture) -> Curves:
     """Fit curves and write the file.
 
     Args:
       path: File to write.
-      instants: Gaussians at evenly spaced times.
+      keyframes: Gaussians at evenly spaced times.
       capture: The capture.
 
     Returns:
       The curves as they are read from the file.
     """
-    data = encode(fit(instants), capture)
+    data = encode(fit(keyframes), capture)
     with replaced_file(path) as partial:
         partial.write_bytes(data)
     return decode(data)
@@ -264,7 +264,7 @@ def write(path: pathlib.Path, instants: Instants, capture: Capture) -> Curves:
 
 def measured(
     curves: Curves,
-    instants: Instants,
+    keyframes: Keyframes,
     draw: Draw,
     state: TrainState,
     raster: RasterSpec,
@@ -274,7 +274,7 @@ def measured(
 
     Args:
       curves: The curves.
-      instants: Gaussians at evenly spaced times.
+      keyframes: Gaussians at evenly spaced times.
       draw: Renderer of the run.
       state: Trained state.
       raster: Settings of the rasterizer.
@@ -284,10 +284,10 @@ def measured(
     Returns:
       The errors.
     """
-    times = np.linspace(0, 1, len(instants.mean))
+    times = np.linspace(0, 1, len(keyframes.mean))
     fitted_means = np.stack([np.asarray(at(curves, time).mean) for time in times])
-    error = np.linalg.norm(fitted_means - instants.mean, axis=-1)
-    error = np.where(instants.opacity > FAINTEST_SEEN, error, 0)
+    error = np.linalg.norm(fitted_means - keyframes.mean, axis=-1)
+    error = np.where(keyframes.opacity > FAINTEST_SEEN, error, 0)
     background = jnp.asarray(capture.background or (0.0, 0.0, 0.0), jnp.float32)
     colors = jnp.asarray(curves.color, jnp.float32)
     render = jax.jit(

@@ -62,7 +62,7 @@ class AccelerationSpec:
         return Bound(self, metadata.extent, metadata.timestamps)
 
 
-def instants(time: Float[Array, ""], interval: float) -> Float[Array, "3"]:
+def sample_times(time: Float[Array, ""], interval: float) -> Float[Array, "3"]:
     """Return three times an `interval` apart, with `time` in the middle.
 
     Near the ends of the capture they are shifted inwards together, because a motion is
@@ -182,7 +182,7 @@ class Bound:
         def evaluate(params):
             sample = splats.take_rows(params, rows)
             canonical = sample.rows["splats"].mean
-            times = instants(condition.time, interval)
+            times = sample_times(condition.time, interval)
             before, now, after = (at_time(sample, t).mean for t in times)
             value = acceleration_loss(canonical, before, now, after, decay, spec.drift)
             static = jnp.mean(_stillness(canonical, now, decay))

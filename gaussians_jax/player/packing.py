@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gaussians_jax.core import splats
-from gaussians_jax.io.sampled import Instants
+from gaussians_jax.io.keyframes import Keyframes
 
 # Smaller offsets are left out: a tenth of a pixel in the nearest training view for
 # means, and changes of an image by less than 1/255 for the others.
@@ -32,14 +32,14 @@ class Packed(NamedTuple):
     data: bytes
 
 
-def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
+def pack(keyframes: Keyframes, still_distance: np.ndarray) -> Packed:
     """Encode Gaussians at several times.
 
     Reference means are float32, so that a distant Gaussian does not reduce the
     precision of near ones. Rotations, scales and colors have 16 bits, opacity has 8.
 
     Args:
-      instants: The Gaussians at these times, scene units.
+      keyframes: The Gaussians at these times, scene units.
       still_distance: [gaussians] displacement that counts as static, scene units.
 
     Returns:
@@ -54,10 +54,10 @@ def pack(instants: Instants, still_distance: np.ndarray) -> Packed:
     }
     arrays = _Arrays()
     # A Gaussian may be brighter than white if others occlude it.
-    color = np.round(np.minimum(instants.color / BRIGHTEST, 1) * 65535)
+    color = np.round(np.minimum(keyframes.color / BRIGHTEST, 1) * 65535)
     arrays.add("color", color.astype(np.uint16), BRIGHTEST / 65535)
     for name, (dtype, scale, shift) in quantizers.items():
-        values = getattr(instants, name).astype(np.float64)
+        values = getattr(keyframes, name).astype(np.float64)
         values = values.reshape(*values.shape[:2], -1)
         reference = (values.min(axis=0) + values.max(axis=0)) / 2
         reference_codes = (reference - shift) / scale

@@ -17,8 +17,13 @@ import numpy as np
 import PIL.Image
 from jaxtyping import Array, Int
 
-from gaussians_jax.io.instants import gaussians_at, written_rows
-from gaussians_jax.io.sampled import Instants, count_for, gathered, seen_in_training
+from gaussians_jax.io.keyframes import (
+    Keyframes,
+    count_for,
+    measure_contributions,
+    sample,
+)
+from gaussians_jax.io.single_time import gaussians_at, written_rows
 from gaussians_jax.player import packing
 from gaussians_jax.player.limits import camera_limits
 from gaussians_jax.splatting.raster_spec import RasterSpec
@@ -31,7 +36,7 @@ from nerfies_jax.training.model import Model, TrainState
 
 # A larger page takes seconds to open in a browser. Larger scenes get fewer times, at
 # least enough to resolve the motion.
-MOST_BYTES, FEWEST_INSTANTS = 48 * 2**20, 8
+MOST_BYTES, FEWEST_KEYFRAMES = 48 * 2**20, 8
 # Rasterizer settings that project() of the page reads.
 # Settings that the page's own project() reads.
 RASTER = (
@@ -69,18 +74,18 @@ def write(
       Summary of the player.
     """
     at, rows = gaussians_at(model, state), written_rows(model, state)
-    statistics = seen_in_training(at, rows, raster, degree, capture)
+    statistics = measure_contributions(at, rows, raster, degree, capture)
     count = count_for(capture)
-    instants, packed_scene = _pack(at, rows, capture, statistics, count)
+    keyframes, packed_scene = _pack(at, rows, capture, statistics, count)
     if len(packed_scene.data) > MOST_BYTES:
         fewer = int(count * MOST_BYTES / len(packed_scene.data))
-        count = max(fewer, FEWEST_INSTANTS)
-        instants, packed_scene = _pack(at, rows, capture, statistics, count)
+        count = max(fewer, FEWEST_KEYFRAMES)
+        keyframes, packed_scene = _pack(at, rows, capture, statistics, count)
     return compose(
         path,
         title,
         packed_scene,
-        _about(instants, packed_scene, capture),
+        _about(keyframes, packed_scene, capture),
         raster,
         capture,
         poster,
@@ -129,8 +134,8 @@ def compose(
 
 
 def _pack(at, rows, capture, statistics, count):
-    instants = gathered(at, rows, statistics, count)
-    return instants, packing.pack(instants, _still_distance(instants, capture))
+    keyframes = sample(at, rows, statistics, count)
+    return keyframes, packing.pack(keyframes, _still_distance(keyframes, capture))
 
 
 def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict:
@@ -166,7 +171,7 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
         "target": target,
     }
     return {
-        "instants": packed.entries["mean.change"]["shape"][0],
+        "keyframes": packed.entries["mean.change"]["shape"][0],
         "seconds": camera_paths.playing_seconds(capture),
         "up": up.tolist(),
         "limits": camera_limits(train, target, up, half_diagonal),
@@ -181,22 +186,22 @@ def header(packed: packing.Packed, raster: RasterSpec, capture: Capture) -> dict
     }
 
 
-def _still_distance(instants: Instants, capture: Capture) -> np.ndarray:
+def _still_distance(keyframes: Keyframes, capture: Capture) -> np.ndarray:
     """Compute the displacement that is invisible: a tenth of a pixel."""
     train = cameras.take(capture.cameras, capture.train)
-    nearest = np.full(instants.mean.shape[1], np.inf)
+    nearest = np.full(keyframes.mean.shape[1], np.inf)
     for position, focal in zip(train.position, train.focal_px, strict=True):
-        distance = np.linalg.norm(instants.mean[0] - position, axis=1)
+        distance = np.linalg.norm(keyframes.mean[0] - position, axis=1)
         nearest = np.minimum(nearest, distance / focal)
     return packing.STILL_PX * nearest
 
 
-def _about(instants, packed_scene, capture):
-    count = instants.mean.shape[1]
+def _about(keyframes, packed_scene, capture):
+    count = keyframes.mean.shape[1]
     return (
         f"{count:,} Gaussians, {packing.moving_rows(packed_scene):,} of them moving, "
-        f"at {len(instants.mean)} times. {instants.left_out:,} that no camera saw are "
-        f"left out. One scene unit is {1 / capture.scale:.3g} of the capture's."
+        f"at {len(keyframes.mean)} times. {keyframes.left_out:,} that no camera saw "
+        f"are left out. One scene unit is {1 / capture.scale:.3g} of the capture's."
     )
 
 

@@ -180,7 +180,7 @@ function uniformsOf(gl, program) {
 const SAMPLERS = ["gaussians", "steps", "meanChange", "quaternionChange", "scaleChange"];
 
 function sceneTextures(gl, header, buffer) {
-  const count = header.arrays.color.shape[0], { instants } = header;
+  const count = header.arrays.color.shape[0], { keyframes } = header;
   const fields = Object.keys(FIELDS).map((name) => fieldOf(name, header, buffer));
   const rowOf = new Int32Array(count).fill(-1);
   let movers = 0;
@@ -190,7 +190,7 @@ function sceneTextures(gl, header, buffer) {
   const all = (kind, texels) => new kind(4 * WIDTH * Math.max(1, Math.ceil(texels / WIDTH)));
   const gaussians = all(Float32Array, 4 * count), steps = all(Float32Array, movers);
   const changes = [Int16Array, Int8Array, Int8Array].map(
-    (kind) => all(kind, instants * movers));
+    (kind) => all(kind, keyframes * movers));
   const color = decoded(header.arrays.color, buffer);
   for (let i = 0; i < count; i++) {
     gaussians[16 * i + 11] = rowOf[i];
@@ -204,7 +204,7 @@ function sceneTextures(gl, header, buffer) {
     }
     rows.forEach((row, r) => {
       steps[4 * rowOf[row] + f] = step[r];
-      for (let t = 0; t < instants; t++) {
+      for (let t = 0; t < keyframes; t++) {
         const from = (t * rows.length + r) * width;
         const to = 4 * (t * movers + rowOf[row]) + first;
         for (let k = 0; k < width; k++) changes[texture][to + k] = change[from + k];
@@ -223,7 +223,7 @@ function sceneTextures(gl, header, buffer) {
     gl.texImage2D(
       gl.TEXTURE_2D, 0, inside, WIDTH, content.length / 4 / WIDTH, 0, format, type, content);
   });
-  return { movers, instants };
+  return { movers, keyframes };
 }
 
 function newTexture(gl) {
@@ -236,7 +236,7 @@ function newTexture(gl) {
 
 // Set all uniforms of PROJECTION.
 function setCamera(set, scene, camera, raster, time) {
-  const { before, share } = between(time, scene.instants);
+  const { before, share } = between(time, scene.keyframes);
   SAMPLERS.forEach((name, unit) => set(name, "1i", unit));
   set("movers", "1i", scene.movers);
   set("before", "1i", before);

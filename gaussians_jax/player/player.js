@@ -147,7 +147,7 @@ function start(header, buffer, source) {
 
   function step(by) {
     play(false);
-    const last = header.instants - 1;
+    const last = header.keyframes - 1;
     setTime(Math.min(Math.max(Math.round(time * last) + by, 0), last) / last);
   }
 

@@ -33,17 +33,17 @@ function fieldOf(name, header, buffer) {
 }
 
 // Return the two stored times around a time in [0, 1], and the position between them.
-function between(time, instants) {
-  const place = Math.min(Math.max(time, 0), 1) * (instants - 1);
-  const before = Math.min(Math.floor(place), instants - 2);
+function between(time, keyframes) {
+  const place = Math.min(Math.max(time, 0), 1) * (keyframes - 1);
+  const before = Math.min(Math.floor(place), keyframes - 2);
   return { before, share: place - before };
 }
 
 // Write the values of a field at a time into `now`, which already has the static ones.
 // Interpolation between stored times is linear.
-function pose(field, time, instants, now) {
+function pose(field, time, keyframes, now) {
   const { width, values, rows, step, change } = field;
-  const { before, share } = between(time, instants);
+  const { before, share } = between(time, keyframes);
   const size = rows.length * width;
   for (let row = 0, at = before * size; row < rows.length; row++) {
     for (let k = 0; k < width; k++, at++) {
@@ -61,7 +61,7 @@ function sorterOf(header, buffer) {
   const now = field.values.slice(), count = now.length / 3;
   const depths = new Float32Array(count), kept = new Uint32Array(count);
   return ({ position, forward, time }) => {
-    pose(field, time, header.instants, now);
+    pose(field, time, header.keyframes, now);
     const [x, y, z] = forward;
     const start = x * position[0] + y * position[1] + z * position[2];
     let seen = 0;

@@ -17,7 +17,7 @@ CURRENT = {
     "nerfies_jax.measure": "nerfies_jax.metrics",
     "nerfies_jax.nets": "nerfies_jax.nn",
     "gaussians_jax.files": "gaussians_jax.io.files",
-    "gaussians_jax.instants": "gaussians_jax.io.instants",
+    "gaussians_jax.instants": "gaussians_jax.io.single_time",
     "gaussians_jax.model_file": "gaussians_jax.io.model_file",
     "gaussians_jax.splats": "gaussians_jax.core.splats",
     "gaussians_jax.splatv": "gaussians_jax.io.splatv",

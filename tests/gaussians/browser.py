@@ -13,7 +13,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from gaussians_jax.io.sampled import Instants
+from gaussians_jax.io.keyframes import Keyframes
 from gaussians_jax.player import packing
 from gaussians_jax.player import page as player_page
 from gaussians_jax.splatting.raster_spec import RasterSpec
@@ -122,7 +122,7 @@ def packed_blobs():
     count, steps = len(BLOBS), np.linspace(0, 1, 24)
     mean = np.tile(np.float32(list(BLOBS.values())), (len(steps), 1, 1))
     mean[:, -1] += steps[:, None] * MOVED
-    instants = Instants(
+    keyframes = Keyframes(
         mean=mean,
         quaternion=np.tile(np.float32([1, 0, 0, 0]), (len(steps), count, 1)),
         log_scale=np.full((len(steps), count, 3), np.log(0.04), np.float32),
@@ -130,7 +130,7 @@ def packed_blobs():
         color=np.float32(list(COLORS.values())),
         left_out=0,
     )
-    return packing.pack(instants, np.full(count, 1e-4))
+    return packing.pack(keyframes, np.full(count, 1e-4))
 
 
 def header():

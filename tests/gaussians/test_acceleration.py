@@ -16,7 +16,7 @@ from tests import gradients
 from tests.gaussians.shared import any_nonzero, finite, full, jitted, put
 
 unrest = jitted(acceleration.acceleration_loss, static_argnums=(4, 5))
-instants = jitted(jax.vmap(acceleration.instants, (0, None)), static_argnums=1)
+sample_times = jitted(jax.vmap(acceleration.sample_times, (0, None)), static_argnums=1)
 draw_active = jitted(acceleration.draw_active, static_argnums=2)
 
 
@@ -121,7 +121,7 @@ def test_slopes_are_finite_at_any_distance_and_free_far_away(distance, dtype):
 @pytest.mark.parametrize("interval", [1 / 300, 0.5, 0.8, *full(1 / 7)])
 def test_the_three_times_stay_within_the_capture(interval, dtype):
     times = np.asarray([0.0, 1e-3, 0.3, 0.5, 1 - 1e-3, 1.0], dtype)
-    before, now, after = np.asarray(instants(times, interval), np.float64).T
+    before, now, after = np.asarray(sample_times(times, interval), np.float64).T
     assert ((before >= 0) & (after <= 1)).all()
     step = min(interval, 0.5)
     np.testing.assert_allclose([now - before, after - now], step, rtol=2e-5)

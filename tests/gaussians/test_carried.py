@@ -13,7 +13,7 @@ from gaussians_jax.core import faces, splats
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Params
 from gaussians_jax.init.points import InitSpec
-from gaussians_jax.io import files, instants
+from gaussians_jax.io import files, single_time
 from gaussians_jax.motion import carried, deformation
 from gaussians_jax.motion.carried import Carried, CarriedSpec, TurnSpec
 from gaussians_jax.motion.mlp import MotionSpec
@@ -332,9 +332,9 @@ def test_rows_that_carry_grow_train_and_are_drawn_by_what_they_carry(tmp_path):
         assert np.isfinite(leaf).all()
         assert leaf.size == 0 or np.any(np.asarray(leaf)[:60] != np.asarray(first)[:60])
     # What a file holds is what is drawn.
-    rows = instants.splats_at(model, state)(0.5)
+    rows = single_time.splats_at(model, state)(0.5)
     assert files.save(tmp_path / "scene.ply", rows) == after["gaussians"]
-    gaussians = instants.gaussians_at(model, state)(0.5)
+    gaussians = single_time.gaussians_at(model, state)(0.5)
     np.testing.assert_allclose(rows.mean, gaussians.mean, atol=1e-6)
 
 

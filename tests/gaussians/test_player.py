@@ -15,7 +15,7 @@ from gaussians_jax import representation
 from gaussians_jax.core import splats
 from gaussians_jax.core.records import SplatRecord
 from gaussians_jax.core.splats import Gaussians
-from gaussians_jax.io import sampled
+from gaussians_jax.io import keyframes
 from gaussians_jax.player import packing
 from gaussians_jax.player import page as player_page
 from gaussians_jax.scene import scene
@@ -109,8 +109,8 @@ def unpacked(page, time):
         stored = np.frombuffer(data, entry["type"], count, entry["offset"])
         value = entry["shift"] + entry["scale"] * stored.astype(float)
         arrays[name] = value.reshape(entry["shape"])
-    place = time * (header["instants"] - 1)
-    first = min(int(place), header["instants"] - 2)
+    place = time * (header["keyframes"] - 1)
+    first = min(int(place), header["keyframes"] - 2)
     now = {}
     for name in ("mean", "quaternion", "log_scale", "opacity"):
         rows = arrays[f"{name}.rows"].astype(int)
@@ -159,20 +159,20 @@ def test_a_scene_too_large_for_a_page_gets_fewer_instants(tmp_path, monkeypatch)
     monkeypatch.setattr(player_page, "MOST_BYTES", 12_000)
     path, poster = tmp_path / "player.html", np.zeros((30, 40, 3), np.uint8)
     representation.player(path, "", SPEC, model, state, capture, poster)
-    assert pack.instants[0] == sampled.LEAST_INSTANTS
-    assert player_page.FEWEST_INSTANTS <= pack.instants[1] < pack.instants[0]
+    assert pack.keyframes[0] == keyframes.LEAST_KEYFRAMES
+    assert player_page.FEWEST_KEYFRAMES <= pack.keyframes[1] < pack.keyframes[0]
     header = json.loads(inside(path, "header"))
-    assert header["instants"] == pack.instants[1]
+    assert header["keyframes"] == pack.keyframes[1]
 
 
 class Packing:
-    """Packs, and remembers how many instants there were."""
+    """Packs, and remembers how many keyframes there were."""
 
     def __init__(self, pack):
-        self._pack, self.instants = pack, []
+        self._pack, self.keyframes = pack, []
 
     def __call__(self, gaussians, still):
-        self.instants.append(len(gaussians.mean))
+        self.keyframes.append(len(gaussians.mean))
         return self._pack(gaussians, still)
 
 
@@ -180,7 +180,7 @@ def test_one_rotation_keeps_one_sign():
     angle = np.linspace(0, 3 * np.pi, 30)  # to and fro over the double cover
     true = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], -1)[:, None]
     flipped = true * np.where(np.arange(30) % 3 == 0, -2, 1)[:, None, None]
-    quaternions = sampled.steady(flipped)
+    quaternions = keyframes.steady(flipped)
     np.testing.assert_allclose(quaternions, -true, atol=1e-12)
 
 
@@ -334,6 +334,8 @@ def test_what_moves_does_not_hide_what_stands_behind_it():
         scales = put(np.repeat(scale[:, None], 3, 1), "float32")
         return Gaussians(put(shifted, "float32"), rows.quaternion, scales, opacity)
 
-    seen = sampled.seen_in_training(at, rows, SPEC.raster, jnp.asarray(0), capture)
-    assert seen.most[9] > sampled.LEAST_SEEN_PX
+    seen = keyframes.measure_contributions(
+        at, rows, SPEC.raster, jnp.asarray(0), capture
+    )
+    assert seen.most[9] > keyframes.LEAST_SEEN_PX
     np.testing.assert_allclose(seen.color[9], 0.25, atol=1e-5)

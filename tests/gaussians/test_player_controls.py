@@ -163,7 +163,7 @@ def test_keys_orbit_pan_zoom_and_reset(opened):
 
 def test_keys_play_step_and_show_help(opened):
     page = opened()
-    last = 23  # instants of the page
+    last = 23  # keyframes of the page
     page.keyboard.press(".")
     page.keyboard.press(".")
     page.keyboard.press(",")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gaussians_jax.io import splatv
-from gaussians_jax.io.sampled import Instants
+from gaussians_jax.io.keyframes import Keyframes
 from tests import scenes
 
 TIMES = np.linspace(0, 1, 25)
@@ -26,7 +26,7 @@ def learned():
     turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
     opacity = np.full((25, 3), 0.6)
     opacity[:, 1] = 0.8 * np.exp(-(((TIMES - 0.8) / 0.2) ** 2))
-    return Instants(
+    return Keyframes(
         mean=mean.astype(np.float32),
         quaternion=turn.astype(np.float32),
         log_scale=np.full((25, 3, 3), math.log(0.05), np.float32),
@@ -37,19 +37,19 @@ def learned():
 
 
 def test_what_moves_on_cubics_and_fades_by_bells_comes_back():
-    instants, capture = learned(), scenes.tiny_capture()
-    curves = splatv.decode(splatv.encode(splatv.fit(instants), capture))
+    keyframes, capture = learned(), scenes.tiny_capture()
+    curves = splatv.decode(splatv.encode(splatv.fit(keyframes), capture))
     for row, time in enumerate(TIMES):
         gaussians = splatv.at(curves, float(time))
-        seen = instants.opacity[row] > 0.02
+        seen = keyframes.opacity[row] > 0.02
         # Half floats of coefficients up to 2 over half a video, 8 bits of opacity
-        off = np.abs(np.asarray(gaussians.mean) - instants.mean[row])
+        off = np.abs(np.asarray(gaussians.mean) - keyframes.mean[row])
         assert off[seen].max() < 2e-3
-        np.testing.assert_allclose(gaussians.opacity, instants.opacity[row], atol=4e-3)
+        np.testing.assert_allclose(gaussians.opacity, keyframes.opacity[row], atol=4e-3)
         turn = np.asarray(gaussians.quaternion)
         turn = turn / np.linalg.norm(turn, axis=1, keepdims=True)
         # 9 degrees to either side: the unit quaternion is off a line by 1e-3 at most
-        np.testing.assert_allclose(turn, instants.quaternion[row], atol=2e-3)
+        np.testing.assert_allclose(turn, keyframes.quaternion[row], atol=2e-3)
     np.testing.assert_allclose(curves.scale, 0.05, rtol=1e-3)
     np.testing.assert_allclose(curves.color[0], [1, 128 / 255, 0], atol=1e-7)
 

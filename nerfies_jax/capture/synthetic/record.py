@@ -44,7 +44,7 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
     moving = moves[hits.thing]  # id -1, for no object, indexes the last entry
     ids = tuple(
         f"{camera}_{place_in_time:05d}"  # sorted by name, frames stay in this order
-        for place_in_time, camera in zip(plan.instant, plan.camera_id, strict=True)
+        for place_in_time, camera in zip(plan.time_index, plan.camera_id, strict=True)
     )
     scene_truth = _truth(spec, plan, hits, ids, programs, seed)
     visible = depths[(depths > 0) & (hits.thing != spec.transient_id)]
@@ -59,8 +59,8 @@ def make(spec: SceneSpec, seed: int = 0) -> tuple[Capture, SceneTruth]:
         heldout=np.flatnonzero(~plan.learn),
         near=float(0.9 * visible.min()),
         far=float(1.1 * depths.max()),
-        warp_ids=plan.instant,
-        appearance_ids=plan.instant,
+        warp_ids=plan.time_index,
+        appearance_ids=plan.time_index,
         camera_ids=plan.camera_id,
         valid=collection.observed(spec, hits.thing),
         moving=None if spec.photographed else moving,

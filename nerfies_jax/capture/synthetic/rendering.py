@@ -22,7 +22,7 @@ SHAKE_HARMONICS = 6  # the fastest component has six periods per capture
 class Schedule(NamedTuple):
     """Times, cameras and exposure of all frames, in NumPy."""
 
-    instant: np.ndarray  # int32 index of the timestamp
+    time_index: np.ndarray  # int32
     camera_id: np.ndarray  # int32: 0 for the hand-held camera, 1 for the second
     time: np.ndarray  # float32 in [0, 1]
     learn: np.ndarray  # bool: True for training frames
@@ -56,47 +56,47 @@ def schedule(spec: SceneSpec, seed: int) -> Schedule:
         return _collection_schedule(spec, seed)
     if spec.snapshots is not None:
         return _snapshot_schedule(spec, seed)
-    instants = np.arange(spec.frames)
-    second_instants = instants[spec.heldout_every // 2 :: spec.heldout_every]
-    instant_index = np.concatenate([instants, second_instants])
-    camera_id = np.repeat([0, 1], [len(instants), len(second_instants)])
-    times = instants / (spec.frames - 1)
+    indices = np.arange(spec.frames)
+    second_indices = indices[spec.heldout_every // 2 :: spec.heldout_every]
+    time_index = np.concatenate([indices, second_indices])
+    camera_id = np.repeat([0, 1], [len(indices), len(second_indices)])
+    times = indices / (spec.frames - 1)
     learn = camera_id == 0
     if spec.skip_every is not None:
-        learn &= instant_index % spec.skip_every != spec.skip_every // 2
+        learn &= time_index % spec.skip_every != spec.skip_every // 2
     arcs = [_arc(spec, times, seed, is_second) for is_second in (False, True)]
     views = cameras.stack(
-        [arcs[c][i] for c, i in zip(camera_id, instant_index, strict=True)]
+        [arcs[c][i] for c, i in zip(camera_id, time_index, strict=True)]
     )
     views = _through_lens(spec, views)
-    frame_times = times[instant_index]
-    transient_shown = np.zeros(len(instant_index), bool)
+    frame_times = times[time_index]
+    transient_shown = np.zeros(len(time_index), bool)
     if spec.transient is not None:
         for start, stop in spec.transient.windows:
             in_window = (start <= frame_times) & (frame_times <= stop)
             transient_shown |= (camera_id == 0) & in_window
     return Schedule(
-        instant_index.astype(np.int32),
+        time_index.astype(np.int32),
         camera_id.astype(np.int32),
         frame_times.astype(np.float32),
         learn,
         views,
-        _light_gain(spec, times, seed)[instant_index],
+        _light_gain(spec, times, seed)[time_index],
         transient_shown,
     )
 
 
 def _collection_schedule(spec, seed):
     """Photographs, and views for evaluation with the appearance of some of them."""
-    instants = np.arange(spec.frames)
-    heldout = instants[spec.heldout_every // 2 :: spec.heldout_every]
-    instant_index = np.concatenate([instants, heldout]).astype(np.int32)
-    photographs = collection.photographs(spec, instant_index, seed)
+    indices = np.arange(spec.frames)
+    heldout = indices[spec.heldout_every // 2 :: spec.heldout_every]
+    time_index = np.concatenate([indices, heldout]).astype(np.int32)
+    photographs = collection.photographs(spec, time_index, seed)
     return Schedule(
-        instant=instant_index,
-        camera_id=np.arange(len(instant_index), dtype=np.int32),
-        time=(instant_index / (spec.frames - 1)).astype(np.float32),
-        learn=np.arange(len(instant_index)) < spec.frames,
+        time_index=time_index,
+        camera_id=np.arange(len(time_index), dtype=np.int32),
+        time=(time_index / (spec.frames - 1)).astype(np.float32),
+        learn=np.arange(len(time_index)) < spec.frames,
         cameras=photographs.cameras,
         light_gain=photographs.light_gain,
         transient_shown=np.asarray(photographs.photo.board_shown),
@@ -106,13 +106,13 @@ def _collection_schedule(spec, seed):
 
 def _snapshot_schedule(spec, seed):
     """Photographs with one camera, of which every n-th is held out."""
-    instants = np.arange(spec.frames, dtype=np.int32)
-    times = instants / (spec.frames - 1)
+    indices = np.arange(spec.frames, dtype=np.int32)
+    times = indices / (spec.frames - 1)
     return Schedule(
-        instant=instants,
+        time_index=indices,
         camera_id=np.zeros(spec.frames, np.int32),
         time=times.astype(np.float32),
-        learn=instants % spec.heldout_every != 0,
+        learn=indices % spec.heldout_every != 0,
         cameras=_through_lens(spec, snapshots.views(spec, seed)),
         light_gain=_light_gain(spec, times, seed),
         transient_shown=np.zeros(spec.frames, bool),

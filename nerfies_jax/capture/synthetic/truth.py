@@ -41,7 +41,7 @@ class SceneTruth(NamedTuple):
     light_gain: np.ndarray  # [frames, 3] float32: exposure as a gain of linear light
     track_thing: np.ndarray  # [tracks] int32
     track_canonical: np.ndarray  # [tracks, 3] float32: the point at time 0, world
-    track_world: np.ndarray  # [tracks, instants, 3] float32
+    track_world: np.ndarray  # [tracks, times, 3] float32
     track_pixel: np.ndarray  # [tracks, frames, 2] float32
     track_seen: np.ndarray  # [tracks, frames] bool
 
@@ -66,13 +66,13 @@ def track_places(capture: Capture, truth: SceneTruth, rows: np.ndarray) -> np.nd
             "create the scene again"
         )
     last = truth.track_world.shape[1] - 1
-    instants = np.round(capture.times[rows] * last).astype(int)
-    if np.abs(instants - capture.times[rows] * last).max() > 1e-3:
+    indices = np.round(capture.times[rows] * last).astype(int)
+    if np.abs(indices - capture.times[rows] * last).max() > 1e-3:
         raise ValueError(
             f"{capture.name}: its frames lie between the {last + 1} timestamps of the "
             "ground truth; create the scene again"
         )
-    world = truth.track_world[:, instants] - np.array(capture.center, np.float32)
+    world = truth.track_world[:, indices] - np.array(capture.center, np.float32)
     return (world * capture.scale).astype(np.float32)
 
 
@@ -206,7 +206,7 @@ def tracks(
       seed: Seed of the selection.
 
     Returns:
-      Object ids [tracks], canonical points [tracks, 3], world points [tracks, instants,
+      Object ids [tracks], canonical points [tracks, 3], world points [tracks, times,
       3], pixels [tracks, frames, 2] and visibility [tracks, frames].
     """
     rng = np.random.default_rng([seed, 3])
@@ -231,7 +231,7 @@ def tracks(
     # The programs expect `spec.tracks` points, so the last one is repeated.
     rows = np.minimum(np.arange(spec.tracks), len(sample) - 1)
     world = np.asarray(programs.follow.result()(thing[rows], material[rows], times))
-    positions = world[:, plan.instant]
+    positions = world[:, plan.time_index]
     pixel, visible = programs.watch.result()(thing[rows], positions, plan)
     world, pixel, visible = (
         np.asarray(x)[: len(sample)] for x in (world, pixel, visible)

@@ -1,4 +1,4 @@
-"""A moving scene as files of single instants, read back by other readers."""
+"""A moving scene as files of single times, read back by other readers."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import plyfile
 import pytest
 
 from gaussians_jax.core import splats
-from gaussians_jax.io import instants
+from gaussians_jax.io import single_time
 from gaussians_jax.scene import scene
 from nerfies_jax import evaluation
 from nerfies_jax.training.model import TrainState
@@ -34,7 +34,7 @@ def columns(path, *names):
 @pytest.mark.full
 def test_the_file_of_an_instant_is_drawn_as_the_scene_is_then(swaying):
     model, state = swaying
-    rows = instants.splats_at(model, state)(0.4)
+    rows = single_time.splats_at(model, state)(0.4)
     view = evaluation.view_of(scenes.tiny_capture(), 0)
     view = view._replace(time=put(0.4, "float32"))
     still = scene.build(scenes.TINY_SPLATS, model.spec[1])
@@ -53,9 +53,9 @@ def test_the_file_of_an_instant_is_drawn_as_the_scene_is_then(swaying):
 
 def test_a_sequence_is_numbered_files_of_the_same_rows(swaying, tmp_path):
     model, state = swaying
-    at = instants.splats_at(model, state)
+    at = single_time.splats_at(model, state)
     folder = tmp_path / "motion"
-    times = instants.save_sequence(folder, at, 3, ".ply")
+    times = single_time.save_sequence(folder, at, 3, ".ply")
     np.testing.assert_array_equal(times, [0, 0.5, 1])
     names = [f"frame_000{number}.ply" for number in range(3)]
     assert sorted(path.name for path in folder.iterdir()) == names
@@ -77,23 +77,23 @@ def test_a_sequence_is_numbered_files_of_the_same_rows(swaying, tmp_path):
         np.testing.assert_array_equal(turn, exact.quaternion[active])
         np.testing.assert_allclose(np.exp(logarithm), exact.scale[active], rtol=2e-6)
     with pytest.raises(ValueError, match="already there"):
-        instants.save_sequence(folder, at, 2, ".ply")
+        single_time.save_sequence(folder, at, 2, ".ply")
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"holds notes\.txt, which would be lost"):
-        instants.save_sequence(folder, at, 2, ".ply", overwrite=True)
+        single_time.save_sequence(folder, at, 2, ".ply", overwrite=True)
     (folder / "notes.txt").unlink()
-    instants.save_sequence(folder, at, 2, ".ply", overwrite=True)
+    single_time.save_sequence(folder, at, 2, ".ply", overwrite=True)
     assert sorted(path.name for path in folder.iterdir()) == names[:2]
     assert [path.name for path in tmp_path.iterdir()] == ["motion"]
 
 
 def test_world_units_place_and_size_gaussians_as_the_capture_does(swaying):
     model, state = swaying
-    rows = instants.splats_at(model, state)(1.0)
+    rows = single_time.splats_at(model, state)(1.0)
     capture = dataclasses.replace(
         scenes.tiny_capture(), scale=0.25, center=(1.0, -2.0, 3.0)
     )
-    world, rows = jax.tree.map(np.asarray, (instants.in_world(rows, capture), rows))
+    world, rows = jax.tree.map(np.asarray, (single_time.in_world(rows, capture), rows))
     np.testing.assert_allclose(world.mean, 4 * rows.mean + capture.center, 1e-6)
     np.testing.assert_allclose(
         np.exp(world.log_scale), 4 * np.exp(rows.log_scale), 1e-5
@@ -101,7 +101,7 @@ def test_world_units_place_and_size_gaussians_as_the_capture_does(swaying):
     # In meters of a map float32 has steps of half a meter.
     far = dataclasses.replace(capture, center=(500_000.0, 4_649_776.0, 120.0))
     with pytest.raises(ValueError, match=r"steps of 0\.5, .* scene \* 4 \+ \(500000, "):
-        instants.in_world(rows, far)
+        single_time.in_world(rows, far)
 
 
 @pytest.mark.hard_cases
@@ -109,7 +109,7 @@ def test_opacities_that_a_motion_drives_to_the_ends_stay_finite(swaying):
     rows = swaying[1].params.rows["splats"]
     deformed = jax.jit(splats.activate)(rows)
     ends = np.resize(np.float32([0, 1]), len(deformed.opacity))
-    as_rows = jax.jit(instants._as_rows)(rows, deformed._replace(opacity=put(ends)))
+    as_rows = jax.jit(single_time._as_rows)(rows, deformed._replace(opacity=put(ends)))
     active = np.asarray(splats.active_mask(rows))
     logit = np.asarray(as_rows.opacity_logit)
     assert np.isfinite(logit).all()
@@ -122,7 +122,7 @@ def test_scales_that_a_motion_takes_below_zero_keep_their_size(swaying):
     rows = swaying[1].params.rows["splats"]
     deformed = jax.jit(splats.activate)(rows)
     through = deformed._replace(scale=deformed.scale * put([1.0, -1.0, -0.5]))
-    as_rows = jax.jit(instants._as_rows)(rows, through)
+    as_rows = jax.jit(single_time._as_rows)(rows, through)
     np.testing.assert_allclose(
         np.exp(as_rows.log_scale), np.abs(through.scale), rtol=1e-5
     )
@@ -131,8 +131,10 @@ def test_scales_that_a_motion_takes_below_zero_keep_their_size(swaying):
 def test_a_field_and_a_time_outside_have_no_gaussians(swaying):
     model, state = swaying
     with pytest.raises(ValueError, match=r"time=1\.5 must lie in"):
-        instants.splats_at(model, state)(1.5)
+        single_time.splats_at(model, state)(1.5)
     with pytest.raises(ValueError, match="need a run of Gaussians"):
-        instants.splats_at(model._replace(stages=None), state)
+        single_time.splats_at(model._replace(stages=None), state)
     with pytest.raises(ValueError, match="not a sequence"):
-        instants.save_sequence("nowhere", instants.splats_at(model, state), 1, ".ply")
+        single_time.save_sequence(
+            "nowhere", single_time.splats_at(model, state), 1, ".ply"
+        )

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 
 from gaussians_jax.core import splats
 from gaussians_jax.core.splats import Gaussians, Splats
-from gaussians_jax.io.instants import At
+from gaussians_jax.io.single_time import At
 from gaussians_jax.splatting import harmonics, projection, raster
 from gaussians_jax.splatting.raster_spec import RasterSpec
 from nerfies_jax import evaluation
@@ -17,7 +17,7 @@ from nerfies_jax.capture.capture import Capture
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.runtime import data_parallel, events
 
-LEAST_INSTANTS, MOST_INSTANTS = 24, 48
+LEAST_KEYFRAMES, MOST_KEYFRAMES = 24, 48
 MOST_VIEWS = 48  # training views that determine visibility and color
 MOST_SIDE_PX = 320  # of their images, because larger ones give the same result
 # Gaussians are left out if they contribute less to every view, in pixels. Built-in
@@ -30,31 +30,31 @@ LEAST_SEEN_PX = 0.1
 MOVES, TIMES = 0.01, 8
 
 
-class Instants(NamedTuple):
+class Keyframes(NamedTuple):
     """Gaussians at evenly spaced times from 0 to 1, without invisible ones."""
 
-    mean: np.ndarray  # [instants, gaussians, 3], scene units
-    quaternion: np.ndarray  # [instants, gaussians, 4] wxyz, unit, with steady signs
-    log_scale: np.ndarray  # [instants, gaussians, 3]
-    opacity: np.ndarray  # [instants, gaussians]
+    mean: np.ndarray  # [keyframes, gaussians, 3], scene units
+    quaternion: np.ndarray  # [keyframes, gaussians, 4] wxyz, unit, with steady signs
+    log_scale: np.ndarray  # [keyframes, gaussians, 3]
+    opacity: np.ndarray  # [keyframes, gaussians]
     color: np.ndarray  # [gaussians, 3], not negative, independent of the direction
     left_out: int  # Gaussians that no camera saw
 
 
-class Seen(NamedTuple):
+class Contributions(NamedTuple):
     """Contribution of each Gaussian to the training views."""
 
     most: np.ndarray  # [gaussians] pixels, in the view with the largest contribution
     color: np.ndarray  # [gaussians, 3], mean over the views weighted by contribution
 
 
-def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
+def sample(at: At, rows: Splats, contributions: Contributions, count: int) -> Keyframes:
     """Evaluate a scene at evenly spaced times, on the host.
 
     Args:
       at: Function from time to Gaussians.
       rows: Raw parameters, for the number of active Gaussians.
-      seen: Contribution of each Gaussian to the training views.
+      contributions: Contribution of each Gaussian to the training views.
       count: Number of times.
 
     Returns:
@@ -63,13 +63,13 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
     Raises:
       ValueError: If no Gaussian is visible from a training camera.
     """
-    is_visible = visible(seen)
+    is_visible = visible(contributions)
     poses = [jax.device_get(at(float(time))) for time in np.linspace(0, 1, count)]
     mean, quaternion, scale, opacity = (
         np.stack([leaf[is_visible] for leaf in leaves])
         for leaves in zip(*poses, strict=True)
     )
-    return Instants(
+    return Keyframes(
         mean=mean,
         quaternion=steady(quaternion),
         log_scale=np.clip(
@@ -77,16 +77,16 @@ def gathered(at: At, rows: Splats, seen: Seen, count: int) -> Instants:
             *splats.LOG_SCALE_RANGE,
         ),
         opacity=opacity,
-        color=seen.color[is_visible],
+        color=contributions.color[is_visible],
         left_out=splats.active_count(rows) - int(is_visible.sum()),
     )
 
 
-def visible(seen: Seen) -> np.ndarray:
+def visible(contributions: Contributions) -> np.ndarray:
     """Select the Gaussians that a training camera saw.
 
     Args:
-      seen: Contribution of each Gaussian to the training views.
+      contributions: Contribution of each Gaussian to the training views.
 
     Returns:
       [gaussians] bool.
@@ -94,11 +94,12 @@ def visible(seen: Seen) -> np.ndarray:
     Raises:
       ValueError: If no Gaussian is visible from a training camera.
     """
-    is_visible = seen.most >= LEAST_SEEN_PX  # NaN compares false and is left out
+    # NaN compares false and is left out.
+    is_visible = contributions.most >= LEAST_SEEN_PX
     if not is_visible.any():
         raise ValueError(
-            f"none of the {len(seen.most)} Gaussians is visible from a training "
-            "camera; train for more steps"
+            f"none of the {len(contributions.most)} Gaussians is visible from a "
+            "training camera; train for more steps"
         )
     return is_visible
 
@@ -113,17 +114,17 @@ def count_for(capture: Capture) -> int:
       Number of distinct timestamps, from 24 to 48.
     """
     times = len(np.unique(capture.times[capture.train]))
-    return int(np.clip(times, LEAST_INSTANTS, MOST_INSTANTS))
+    return int(np.clip(times, LEAST_KEYFRAMES, MOST_KEYFRAMES))
 
 
-@events.stage("finding the Gaussians that are seen")
-def seen_in_training(
+@events.stage("finding visible Gaussians")
+def measure_contributions(
     at: At,
     rows: Splats,
     raster_spec: RasterSpec,
     degree: Int[Array, ""],
     capture: Capture,
-) -> Seen:
+) -> Contributions:
     """Measure the contribution and mean color of each Gaussian in the training views.
 
     Every view is evaluated twice, with and without moving Gaussians, to include
@@ -165,7 +166,7 @@ def seen_in_training(
         total = total + weight
         color = color + weight[:, None] * jax.device_get(colors)
     total_weight = np.maximum(total, np.finfo(np.float32).tiny)
-    return Seen(np.asarray(most), color / total_weight[:, None])
+    return Contributions(np.asarray(most), color / total_weight[:, None])
 
 
 def _weights(how, gaussians: Gaussians, camera: Camera):
