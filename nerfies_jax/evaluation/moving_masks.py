@@ -35,7 +35,7 @@ def with_masks(capture: Capture, folder: pathlib.Path) -> tuple[Capture, str]:
         factor = math.ceil(math.sqrt(len(rows) * math.prod(capture.size) / MAX_PIXELS))
         video = dataclasses.replace(capture, train=rows, heldout=np.zeros(0, int))
         video = captures.downscale(captures.select(video, rows), factor)
-        evidence = record.cached(video, folder)
+        evidence = record.cached(video, folder, masks_only=True)
         if not evidence.unusable:
             break
         unusable = unusable or evidence.unusable

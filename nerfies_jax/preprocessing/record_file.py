@@ -54,19 +54,23 @@ RECORDS: dict[str, type[NamedTuple]] = {
 }
 
 
-def digest(capture: Capture, use_depths: bool = False) -> str:
+def digest(
+    capture: Capture, use_depths: bool = False, masks_only: bool = False
+) -> str:
     """Compute a digest of all inputs of `gather`.
 
     Args:
       capture: The capture.
       use_depths: As for `gather`.
+      masks_only: As for `gather`.
 
     Returns:
       Hex digits.
     """
     checksum = hashlib.blake2b(digest_size=12)
     budget = capture.preprocessing
-    checksum.update(f"evidence {VERSION} {use_depths} {budget}".encode())
+    options = f"{use_depths} {budget}{' masks only' * masks_only}"
+    checksum.update(f"evidence {VERSION} {options}".encode())
     images = capture.images
     checksum.update(f"{images.dtype}{(len(capture.train), *images.shape[1:])}".encode())
     for row in capture.train:  # one at a time, because a copy of all may be large

@@ -21,7 +21,7 @@ def masks_of(capture: Capture) -> np.ndarray | None:
     """
     rows = np.arange(len(capture.ids))
     all_frames = dataclasses.replace(capture, train=rows, heldout=rows[:0])
-    evidence = record.gather(all_frames, rough_cameras=True)
+    evidence = record.gather(all_frames, rough_cameras=True, masks_only=True)
     if evidence.unusable or evidence.moving.mean() < MIN_MOVING_SHARE:
         return None
     return frame_masks.of_frames(evidence, capture)

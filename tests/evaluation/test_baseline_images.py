@@ -161,8 +161,9 @@ def looked(tmp_path, monkeypatch):
     """
     looked_at = []
 
-    def cached(capture, folder):
+    def cached(capture, folder, masks_only):
         looked_at.append(capture)
+        assert masks_only
         assert folder == tmp_path
         order = capture.train[np.argsort(capture.times[capture.train], kind="stable")]
         wide = pinholes.canvas(capture)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 import scipy.ndimage as nd
@@ -391,6 +392,23 @@ def test_the_card_is_where_it_is():
     assert speed["speed_px"] == pytest.approx(
         step / two_planes.NEAR * two_planes.FOCAL, rel=0.1
     )
+
+
+def test_masks_alone_are_those_of_the_whole_preprocessing(tmp_path):
+    capture, whole = gathered()
+    masks = record.gather(capture, masks_only=True)
+    for name in ("row", "moving", "score", "flow", "tracks"):
+        jax.tree.map(
+            np.testing.assert_array_equal, getattr(masks, name), getattr(whole, name)
+        )
+    assert len(whole.path_tracks.visible)
+    assert not len(masks.path_tracks.visible)
+    assert not len(masks.still.position)
+    # A record without paths is never read in place of a whole one.
+    files = {
+        record.file_of(capture, tmp_path, masks_only=only) for only in (False, True)
+    }
+    assert len(files) == 2
 
 
 @pytest.mark.full

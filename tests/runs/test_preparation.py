@@ -110,8 +110,9 @@ def test_masks_are_of_every_frame_and_of_its_size(monkeypatch):
     small = np.random.default_rng(0).random((7, 7, 10)) < 0.2  # a quarter, and 2 rest
     moving = types.SimpleNamespace(unusable="", moving=small, row=order, factor=4)
 
-    def gather(mapper, rough_cameras):
+    def gather(mapper, rough_cameras, masks_only):
         assert rough_cameras  # of the first pass
+        assert masks_only
         assert mapper.train.tolist() == list(range(7))  # held-out ones too
         return moving
 
