@@ -104,13 +104,14 @@ def votes(views: Views, tracks: Tracks, score: np.ndarray) -> np.ndarray:
         rows = np.flatnonzero(tracks.visible[:, frame])
         if len(rows) < VOTES:
             continue
-        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
+        color = _lab(views, frame)
         place = tracks.pixel[rows, frame]
-        theirs = color[pixel_of(place, (height, width))]
+        row, column = pixel_of(place, (height, width))
+        theirs = color[:, row, column]
         distance, near = cKDTree(place).query(at + 0.5 * VOTE_STEP, VOTES)
         distance = (distance / image_scale(width)).astype(np.float32)
-        unlike = color[at[:, 1], at[:, 0], None] - theirs[near]
-        unlike = np.einsum("pvc,pvc->pv", unlike, unlike) / VOTE_COLOR**2
+        unlike = _squares(color[:, at[:, 1], at[:, 0], None] - theirs[:, near])
+        unlike /= VOTE_COLOR**2
         weight = np.exp(-0.5 * ((distance / VOTE_PX) ** 2 + unlike))
         weight += 1e-9 * np.exp(-distance / VOTE_PX)
         share = (weight * score[rows][near]).sum(1) / weight.sum(1)
@@ -151,9 +152,20 @@ def mask(views: Views, share: np.ndarray, odds: np.ndarray) -> np.ndarray:
     total = np.log(share / (1 - share)) + odds
     moving = np.zeros(total.shape, bool)
     for frame, one in enumerate(total):
-        color = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB).astype(np.float32)
-        moving[frame] = _smooth(one.astype(np.float32), color) > 0
+        moving[frame] = _smooth(one.astype(np.float32), _lab(views, frame)) > 0
     return moving
+
+
+def _lab(views, frame):
+    """Return the CIELAB color of a frame, [3, height, width]."""
+    lab = cv2.cvtColor(views.image[frame], cv2.COLOR_RGB2LAB)
+    return np.ascontiguousarray(np.moveaxis(lab, -1, 0), np.float32)
+
+
+def _squares(difference):
+    """Return squared lengths of vectors along the first axis."""
+    first, second, third = difference
+    return first * first + second * second + third * third
 
 
 def settled(tracks: Tracks, score: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -189,13 +201,14 @@ def share_on(tracks: Tracks, moving: np.ndarray) -> np.ndarray:
 
 
 def _smooth(values, color):
-    """Apply a bilateral filter: average nearby pixels of similar color."""
+    """Apply a bilateral filter: average nearby pixels of similar color [3, h, w]."""
     height, width = values.shape
-    values, color = (
-        cv2.copyMakeBorder(one, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)
-        for one in (values, color)
+    own = color
+    values, *planes = (
+        cv2.copyMakeBorder(plane, *(SMOOTH_REACH,) * 4, cv2.BORDER_REFLECT)
+        for plane in (values, *color)
     )
-    own = color[SMOOTH_REACH:-SMOOTH_REACH, SMOOTH_REACH:-SMOOTH_REACH]
+    color = np.stack(planes)
     total, weights = np.zeros((2, height, width), np.float32)
     reach = range(-SMOOTH_REACH, SMOOTH_REACH + 1)
     for down, right in ((i, j) for i in reach for j in reach if (i + j) % 2 == 0):
@@ -203,8 +216,7 @@ def _smooth(values, color):
             SMOOTH_REACH + down : SMOOTH_REACH + down + height,
             SMOOTH_REACH + right : SMOOTH_REACH + right + width,
         ]
-        unlike = color[there] - own
-        unlike = np.einsum("hwc,hwc->hw", unlike, unlike) / SMOOTH_COLOR**2
+        unlike = _squares(color[:, *there] - own) / SMOOTH_COLOR**2
         near = (down**2 + right**2) / SMOOTH_PX**2
         weight = np.exp(-0.5 * (unlike + np.float32(near)))
         total += weight * values[there]

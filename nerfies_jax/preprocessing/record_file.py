@@ -54,9 +54,7 @@ RECORDS: dict[str, type[NamedTuple]] = {
 }
 
 
-def digest(
-    capture: Capture, use_depths: bool = False, masks_only: bool = False
-) -> str:
+def digest(capture: Capture, use_depths: bool = False, masks_only: bool = False) -> str:
     """Compute a digest of all inputs of `gather`.
 
     Args:
