@@ -16,7 +16,7 @@ from nerfies_jax.preprocessing.rest_points import RestPoints
 from nerfies_jax.preprocessing.tracks import Tracks
 from nerfies_jax.preprocessing.watch import Seconds
 
-VERSION = 22
+VERSION = 23
 
 
 class Evidence(NamedTuple):

@@ -40,11 +40,12 @@ DOUBTFULLY_TOLD = 0.02
 # they are not parts of an object: those of the squashed ball have scales that differ by
 # 8 %.
 BADLY_TOLD, MOST_OF_OBJECT = 0.05, 0.7
-# Logarithm of the likelihood ratio from which the factor of a rigid body is applied. Of
-# rigid objects of the built-in scenes, those whose paths are 0 to 1.2 % from the true
-# distance have 0 to 0.5, with factors that are wrong by as much, and shutters that are
-# 4 % from it have 8 to 13. That of the squashed ball, 5 % from it, is below 0.5.
-LEAST_NATS = 0.5
+# Logarithm of the likelihood ratio from which the factor of a rigid body is applied: 95
+# % confidence (Wilks 1938, one degree of freedom). Rigid objects of the built-in scenes
+# whose paths are 0 to 1.2 % from the true distance have 0 to 1, with factors that are
+# wrong by up to 3.7 %, and shutters that are 4 % from it have 8 to 13. That of the
+# squashed ball, 5 % from it, is below 0.5.
+LEAST_NATS = 2.0
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
 # Drift of tracks looks like motion along the rays: with 0.1 px, the depth of a forearm
