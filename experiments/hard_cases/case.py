@@ -44,7 +44,7 @@ class Case(NamedTuple):
     # Errors are relative to the largest entry of the truth, which counts as at least
     # this: by order, for the points where the truth itself is or nears zero.
     floors: tuple[float, ...] = (0.0, 0.0, 0.0)
-    switch: str = "none"  # where the formula changes
+    switch: str = "no switch"  # where the formula changes
     timed: np.ndarray | None = None  # [n] a usual input, to time (default: the middle)
     alike: bool = True  # both forms do the same work, so that their times compare
 

@@ -89,9 +89,9 @@ _STRAINS = np.array(
 )
 SMALL_STRAIN = Case(
     name="strain of a small displacement",
-    breaks="J = 1 + D rounds D away: 1e-8 is lost whole in float32",
-    formula="log1p over the eigenvalues of D + Dᵀ + DᵀD",
-    switch=f"|D| = {matrix3.SMALL_DISPLACEMENT:g}",
+    breaks="J = 1 + D rounds D away. 1e-8 is lost entirely in float32.",
+    formula="log1p of the eigenvalues of D + Dᵀ + DᵀD is used",
+    switch=f"switch at |D| = {matrix3.SMALL_DISPLACEMENT:g}",
     axis="share of D",
     at=_STRAINS,
     along=ALONG,
@@ -107,8 +107,8 @@ SMALL_STRAIN = Case(
 _EQUAL = np.array([0, 2.0**-12, 2.0**-9, 2.0**-6, 2.0**-3, 2.0**-1])
 EQUAL_VALUES = Case(
     name="equal singular values",
-    breaks="second derivatives of LAPACK's rule are NaN where two are equal",
-    formula="divided differences through log1p(x)/x",
+    breaks="Second derivatives of LAPACK's SVD are NaN where two are equal.",
+    formula="Divided differences are computed by log1p(x)/x",
     axis="share of D about 2",
     at=_EQUAL,
     along=ALONG,
@@ -141,9 +141,11 @@ def _of_stretches(form):
 _LEAST = np.array([1e-5, 1e-4, 1e-3, 9.99e-3, 1.001e-2, 2e-2, 0.1, 0.5])
 COLLAPSE = Case(
     name="a direction that collapses",
-    breaks="JᵀJ loses stretches below 3e-4; log 0, or a clamp without gradient",
-    formula="one-sided Jacobi on J itself; tangent of the logarithm",
-    switch=f"stretch = {matrix3.COLLAPSED:g}",
+    breaks="JᵀJ loses singular values below 3e-4. log 0 is infinite, and a clamp has "
+    "no gradient.",
+    formula="One-sided Jacobi rotations are applied to J itself, and the logarithm "
+    "is continued by its tangent",
+    switch=f"switch at a singular value of {matrix3.COLLAPSED:g}",
     axis="least stretch",
     at=_LEAST,
     points=np.stack([np.full(8, 1.5), np.full(8, 0.75), _LEAST], axis=1),
@@ -157,9 +159,10 @@ COLLAPSE = Case(
 _THROUGH = np.array([-2, -1, -0.1, -1e-2, -1e-3, 0, 1e-3, 1e-2 * (1 - 1e-6), 0.1, 0.5])
 FOLD = Case(
     name="a fold, through the collapse",
-    breaks="mirror images cost nothing, and log 0 lies between",
-    formula="least stretch with the determinant's sign, tangent of the logarithm",
-    switch=f"stretch = {matrix3.COLLAPSED:g}",
+    breaks="Reflections have no energy, and log 0 lies between them and the identity.",
+    formula="The smallest singular value has the sign of the determinant, and the "
+    "logarithm is continued by its tangent",
+    switch=f"switch at a singular value of {matrix3.COLLAPSED:g}",
     axis="least stretch, signed",
     at=_THROUGH,
     points=np.stack([np.full(10, 3.0), np.full(10, 2.5), _THROUGH], axis=1),

@@ -43,9 +43,11 @@ _SEAMS = [x / TOP for edge in (0.25, 0.75, 2.25) for x in sides(edge)]
 _PI_PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, *_SEAMS, 0.7371, 1, 10, 1e3, 1e4])
 HALF_TURNS = Case(
     name="sin and cos of 2ᵏπx",
-    breaks="π is rounded in before the reduction: k = 9 is noise at x = 1e4",
-    formula="x - 2 round(x/2) first, then quadrants and a polynomial on [-¼, ¼]",
-    switch="quadrants, odd eighths of a period",
+    breaks="The product with π is rounded before the reduction. At x = 1e4, k = 9 is "
+    "noise.",
+    formula="x - 2 round(x/2) is computed first, then quadrants and a polynomial on "
+    "[-¼, ¼]",
+    switch="switch of quadrants at odd eighths of a period",
     axis="x",
     at=_PI_PLACES,
     stable=_features(TIMES_PI),
@@ -71,9 +73,9 @@ def _quarter_turn_on(x):
 _PLACES = _with_negatives([0, 1e-30, 1e-8, 1e-4, 0.01, 0.7371, 1, 10, 1e3, 1e4])
 PLAIN_WAVES = Case(
     name="sin and cos of 2ᵏx",
-    breaks="cos as sin(a + π/2): the sum is rounded to an ulp of a",
-    formula="sin and cos of the exact product, as XLA has them",
-    switch="|2ᵏx| = 12,800 of any number of the array",
+    breaks="cos a is computed as sin(a + π/2), and the sum is rounded to an ulp of a.",
+    formula="sin and cos of the exact product are those of XLA",
+    switch="switch of the whole array if any |2ᵏx| exceeds 12,800",
     axis="x",
     at=_PLACES,
     stable=_features(PLAIN),
@@ -113,9 +115,11 @@ _NEAR = _with_negatives(
 )
 NEAR_WAVES = PLAIN_WAVES._replace(
     name="sin and cos of 2ᵏx up to 12,800",
-    breaks="x - n π/2 with π/2 rounded: n times its error, 3e-4 at the end",
-    formula="π/2 in three parts, then quadrants and a polynomial on [-π/4, π/4]",
-    switch="quadrants, odd eighths of a period; |2ᵏx| = 12,800",
+    breaks="x - n π/2 with a rounded π/2 has n times its error, 3e-4 at the end.",
+    formula="π/2 is subtracted in three parts, then quadrants and a polynomial on "
+    "[-π/4, π/4] are used",
+    switch="switch of quadrants at odd eighths of a period, and to XLA at |2ᵏx| = "
+    "12,800",
     at=_NEAR,
     textbook=_one_part,
 )
@@ -139,10 +143,11 @@ _OPENING = np.array(
     [0, 1e-15, 1e-8, 1e-5, 1e-4, 1e-3, 0.01, 0.1, *sides(0.5), *sides(1.0), 3.25, 6]
 )
 WINDOW = Case(
-    name="window of a band that opens",
-    breaks="½(1 - cos πa) cancels: 0 below a = 1e-4, a gradient that is not 0 at 0",
-    formula="sin²(πa/2) by the same polynomial",
-    switch="quadrant, a = ½",
+    name="coarse-to-fine window of a band",
+    breaks="½(1 - cos πa) cancels. It is 0 below a = 1e-4, and its gradient is not 0 "
+    "at 0.",
+    formula="sin²(πa/2) is computed by the polynomial for 2ᵏπx",
+    switch="switch of quadrants at a = ½",
     axis="bands open, a",
     at=_OPENING,
     stable=lambda alpha: encoding.anneal(OPENED, alpha[0]),
@@ -178,10 +183,12 @@ def _exact_contraction(x):
 
 _DISTANCES = _with_negatives([0, 1e-30, 1e-8, 0.5, *sides(1.0), 2, 100, 1e8, 1e30])
 CONTRACTION = Case(
-    name="contraction of space",
-    breaks="(2 - 1/|x|) x/|x| in the branch not taken: NaN gradient at the center",
-    formula="the norm clamped at one there, x / |x| before the factor",
-    switch="the box, |x| = 1",
+    name="scene contraction",
+    breaks="The branch that is not selected, (2 - 1/|x|) x/|x|, has a NaN gradient "
+    "at the center.",
+    formula="The norm is clamped to at least 1 there, and x / |x| is computed before "
+    "the factor",
+    switch="switch at the box, |x| = 1",
     axis="|x|",
     at=_DISTANCES,
     stable=_contract(grids.contract),

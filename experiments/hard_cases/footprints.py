@@ -98,9 +98,11 @@ def _needle(length, width=0.02):
 _OFFSET = 20 * _ALONG + 0.4 * _ACROSS  # px
 
 NEEDLE = Case(
-    name="Gaussian of a needle",
-    breaks="ac - b² has no digit left from 3000 px: values above 1, infinite gradients",
-    formula="u = p dx, v = r (dy - k dx); c - b²/a as a sum of squares",
+    name="needle-shaped Gaussian",
+    breaks="ac - b² has no digits left from 3000 px on. Values exceed 1, and "
+    "gradients are infinite.",
+    formula="u = p dx and v = r (dy - k dx) are used, with c - b²/a as a sum of "
+    "squares",
     axis="length / px",
     at=_LENGTHS,
     points=np.array([[*_needle(length), *_OFFSET] for length in _LENGTHS]),
@@ -130,9 +132,9 @@ def _exact_antialiased(x):
 _RATIOS = np.array([1, 1e2, 1e3, 1e4, 1e6])
 
 ANTIALIASED = Case(
-    name="antialiasing factor of a needle",
-    breaks="det J Σ Jᵀ of a ratio of 1e3 is 9 % off, of 1e4 of any sign",
-    formula="|cross(t1, t2)|² of the rows of T = J W R diag(s); no Σ",
+    name="antialiasing factor of a needle-shaped Gaussian",
+    breaks="det J Σ Jᵀ is 9 % off at a ratio of 1e3, and has any sign at 1e4.",
+    formula="|cross(t1, t2)|² of the rows of T = J W R diag(s) is computed, without Σ",
     axis="length over width",
     at=_RATIOS,
     points=np.array([_needle(0.25 * ratio, 0.25) for ratio in _RATIOS]),
@@ -183,8 +185,8 @@ def _exact_mean_px(x):
 
 FAR_MEAN = Case(
     name="mean in px, far from the origin",
-    breaks="R x + t: 0.16 px off at 1e4 units, 14 px at 1e6",
-    formula="R (x - c)",
+    breaks="R x + t is off by 0.16 px at 1e4 units and by 14 px at 1e6.",
+    formula="R (x - c) is computed",
     axis="distance / scene units",
     at=_DISTANCES,
     points=np.array(
@@ -203,8 +205,8 @@ _TOWARD = np.array([0.36, -0.48, 0.8])
 
 DIRECTION = Case(
     name="direction of a short or long offset",
-    breaks="|v|² is 0 below 1e-19 and infinite above 1e19 (f32)",
-    formula="divided by the largest component first",
+    breaks="|v|² is 0 below 1e-19 and infinite above 1e19 (f32).",
+    formula="v is divided by its largest component first",
     axis="|v| / scene units",
     at=_REACHES,
     along=_TOWARD,

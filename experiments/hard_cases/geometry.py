@@ -59,8 +59,8 @@ _DISTANCES = np.array([1.0, 100, 1e4, 1e6])
 _POSITIONS = _DISTANCES[:, None] * np.array([1.0, -1, 1])
 FAR_CAMERA = Case(
     name="camera far from the origin",
-    breaks="R x + t cancels: 0.16 px at 1e4, 14 px at 1e6",
-    formula="R (x - c)",
+    breaks="R x + t cancels. The error is 0.16 px at 1e4 units and 14 px at 1e6.",
+    formula="R (x - c) is computed",
     axis="distance / scene units",
     at=_DISTANCES,
     points=np.concatenate([_POSITIONS + np.array([0.5, 0.25, 4]), _POSITIONS], axis=1),
@@ -88,9 +88,10 @@ _DEPTHS = np.array(
 )
 NEAR_PLANE = Case(
     name="point at or behind the camera",
-    breaks="x/z is infinite at 0, and behind the camera lands inside the image",
-    formula="depth at least 1e-4 of the lateral offset and 1e-12",
-    switch=f"slope = {cameras.MAX_SLOPE:g}",
+    breaks="x/z is infinite at z = 0, and points behind the camera land inside the "
+    "image.",
+    formula="The depth is at least 1e-4 of the lateral offset and 1e-12",
+    switch=f"switch at a lateral offset of {cameras.MAX_SLOPE:g} depths",
     axis="z / scene units",
     at=_DEPTHS,
     points=np.stack([np.ones(10), np.full(10, -0.5), _DEPTHS], axis=1),
@@ -133,8 +134,10 @@ def _exact_undistorted(distorted_slopes):
 _BENT = np.array([0, 1e-20, 1e-6, 0.1, 0.3, 0.5, 0.54, 0.544])
 LENS_FOLD = Case(
     name="undistortion up to the fold",
-    breaks="fixed-point steps creep: ten are 4 % off near the fold",
-    formula="bracketed Newton, derivative of the implicit function",
+    breaks="Fixed-point iterations converge slowly. Ten of them are 4 % off near the "
+    "fold.",
+    formula="Bracketed Newton iterations are used, with the derivative of the "
+    "implicit function",
     axis="distorted radius",
     at=_BENT,
     along=np.array([0.6, -0.8]),
@@ -172,9 +175,10 @@ def _exact_span(direction):
 _SLANTS = np.array([0, 1e-38, 1e-30, 1e-20, 1e-10, 1e-3, 0.25])
 BOX = Case(
     name="ray along a face of the box",
-    breaks="0/0 in the plane of a face; gradients of quotients by 1e-20 overflow",
-    formula="components without motion cross nothing",
-    switch=f"component = {rays.PARALLEL:g}",
+    breaks="A ray in the plane of a face gives 0/0, and gradients of quotients by "
+    "1e-20 overflow.",
+    formula="Planes parallel to the ray are not intersected",
+    switch=f"switch at a direction component of {rays.PARALLEL:g}",
     axis="component across",
     at=_SLANTS,
     points=np.stack([np.ones(7), -_SLANTS, 0.5 * _SLANTS], axis=1),

@@ -42,8 +42,8 @@ def _exact_amplitudes(pixels):
 
 AMPLITUDE = Case(
     name="Fourier amplitudes of an almost black image",
-    breaks="√(re² + im²) is 0 below 1e-19 (f32), its gradient 0/0",
-    formula="abs of the complex number; gradient 0 where it vanishes",
+    breaks="√(re² + im²) is 0 below 1e-19 (f32), and its gradient is 0/0.",
+    formula="abs of the complex number is used, with gradient 0 where it vanishes",
     axis="contrast",
     at=_CONTRAST,
     along=_PATTERN,
@@ -113,8 +113,10 @@ def _exact_dssim(x):
 
 DSSIM = Case(
     name="SSIM of images almost alike",
-    breaks="E[xy] - E[x] E[y]: 4e-5 off at level 0.9, a noisy gradient where it is 0",
-    formula="a + b - ab from the window of image - target, about the target's mean",
+    breaks="E[xy] - E[x] E[y] is off by 4e-5 at level 0.9, and its gradient is noise "
+    "where it should be 0.",
+    formula="a + b - ab is computed from the filtered image - target, about the mean "
+    "of the target",
     axis="row of level, offset, contrast",
     at=np.arange(len(_LEVELS), dtype=float),
     points=np.array(_LEVELS),
@@ -143,8 +145,8 @@ def _bands_textbook(pixels):
 
 HAAR = Case(
     name="wavelet bands of low contrast",
-    breaks="sums of pixels round before they are subtracted",
-    formula="differences of neighbors first",
+    breaks="Sums of pixels are rounded before they are subtracted.",
+    formula="Differences of neighbors are computed first",
     axis="contrast at level 1000.3",
     at=_SOFT,
     points=1000.3 + _SOFT[:, None] * _QUAD,
@@ -185,8 +187,8 @@ def _exact_pearson(x):
 
 CORRELATION = Case(
     name="1 - correlation of depths that agree",
-    breaks="1 - r is a few ulps of 1",
-    formula="half the mean square of the difference of standardized depths",
+    breaks="1 - r is a few ulps of 1.",
+    formula="Half the mean square of the difference of standardized depths is used",
     axis="departure from the truth",
     at=_OFF,
     points=_DEPTHS + _OFF[:, None] * _WRONG,

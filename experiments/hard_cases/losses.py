@@ -36,9 +36,10 @@ def _exact_sq(r):
 
 GEMAN = Case(
     name="Geman-McClure of a vector",
-    breaks="a length has no gradient at 0; 2 - 2/(1 + u) is 0 below u = 1e-8",
-    formula="2u/(1 + u) of u = |r|²/4c², 1/(1 + 1/u) above; derivative 1/(1 + u)²",
-    switch="u = 1",
+    breaks="A norm has no gradient at 0, and 2 - 2/(1 + u) is 0 below u = 1e-8.",
+    formula="2u/(1 + u) of u = |r|²/4c² is used, as 2/(1 + 1/u) for large u, and "
+    "u/(1 + u) has the derivative 1/(1 + u)²",
+    switch="switch at u = 1",
     **_along([0, 1e-15, 1e-9, 1e-6, 1e-3, *_sides(2 * WIDTH), 1, 1e3, 1e6, 1e15]),
     stable=lambda r: losses.geman_mcclure(jnp.sum(r**2), WIDTH)[None],
     textbook=_geman_by_power,
@@ -60,9 +61,9 @@ def _exact_charbonnier(r):
 
 CHARBONNIER = Case(
     name="Charbonnier of a vector",
-    breaks="√(s + c²) - c is 0 below s = 1e-7 c², and its digits go before",
-    formula="s / (√(s + c²) + c), from s = 8 c² on √(s + c²) - c",
-    switch="s = 8 c²",
+    breaks="√(s + c²) - c is 0 below s = 1e-7 c², and loses digits earlier.",
+    formula="s / (√(s + c²) + c) is used, and √(s + c²) - c for large s",
+    switch="switch at s = 8 c²",
     **_along([0, 1e-15, 1e-9, 1e-6, 1e-3, WIDTH, 1, 1e3, 1e6, 1e15]),
     stable=lambda r: losses.charbonnier(jnp.sum(r**2), WIDTH)[None],
     textbook=_charbonnier_by_difference,
@@ -87,9 +88,9 @@ def _exact_huber(r):
 
 HUBER = Case(
     name="Huber of a vector",
-    breaks="the length has no gradient at 0",
-    formula="s / 2 of the squared length; the root is taken of what is above",
-    switch="|r| = c",
+    breaks="A norm has no gradient at 0.",
+    formula="s / 2 is computed from the squared norm, and the root only of larger ones",
+    switch="switch at |r| = c",
     **_along([0, 1e-15, 1e-9, 1e-3, *_sides(WIDTH), 1, 1e3, 1e6, 1e15]),
     stable=lambda r: losses.huber(jnp.sum(r**2), WIDTH)[None],
     textbook=_huber_of_length,
@@ -103,9 +104,10 @@ _ERRORS = np.array([0, 1e-30, *_sides(1e-10), 1e-8, 1e-4, 0.1, 10, 1e6])
 
 PSNR = Case(
     name="PSNR of equal images",
-    breaks="log of 0; log(mse + 1e-10) reads 79.957 dB for 80, gradient -4e10 at 0",
-    formula="log of max(mse, 1e-10)",
-    switch="mse = 1e-10",
+    breaks="log 0 is infinite. log(mse + 1e-10) gives 79.957 dB instead of 80 and a "
+    "gradient of -4e10 at 0.",
+    formula="log of max(mse, 1e-10) is used",
+    switch="switch at mse = 1e-10",
     axis="mean squared error",
     at=_ERRORS,
     stable=losses.psnr,
@@ -144,8 +146,9 @@ def _exact_uncertain(x):
 
 NERF_W = Case(
     name="NeRF-W's loss over its raw β",
-    breaks="log(1 + exp(x)) is infinite from x = 89 (709), 0 / ∞ in its gradient",
-    formula="softplus by logaddexp, β_min added, r / β squared",
+    breaks="log(1 + exp(x)) is infinite from x = 89 on (709 in f64), with 0 / ∞ in "
+    "its gradient.",
+    formula="softplus is computed by logaddexp, β_min is added, and r / β is squared",
     axis="raw β",
     at=_RAW,
     points=np.concatenate([np.tile(_RESIDUAL, (len(_RAW), 1)), _RAW[:, None]], 1),
@@ -172,9 +175,10 @@ def _exact_srgb(light):
 
 SRGB = Case(
     name="sRGB at black",
-    breaks="the gradient of the power is infinite at 0, and `where` multiplies it by 0",
-    formula="the power sees 1 where the line is taken",
-    switch="light = 0.0031308",
+    breaks="The gradient of the power is infinite at 0, and `where` multiplies it by "
+    "0.",
+    formula="The power is evaluated at 1 where the linear branch is selected",
+    switch="switch at a linear value of 0.0031308",
     axis="linear light",
     at=_LIGHT,
     stable=texture.srgb,

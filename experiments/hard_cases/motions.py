@@ -29,9 +29,9 @@ def _exact_sparsity(x):
 
 
 SPARSITY = Case(
-    name="trajectories that a Gaussian at rest uses",
-    breaks="sum |c| / max |c| is 0/0; its gradient at 1e-12 is 1e12",
-    formula="1e-3, which moves nothing, added to the denominator",
+    name="trajectory sparsity of a static Gaussian",
+    breaks="sum |c| / max |c| is 0/0, and its gradient at 1e-12 is 1e12.",
+    formula="1e-3, a negligible coefficient, is added to the denominator",
     axis="largest coefficient",
     at=_SIZES,
     along=_SHARES,
@@ -63,10 +63,12 @@ def _exact_visible(x):
 
 
 VISIBLE = Case(
-    name="opacity over time of any width",
-    breaks="s / w is 0/0 once the width has underflowed, at -104 (-745)",
-    formula="exp(-(s e^-w)²), the logarithm of the width clamped to ±9",
-    switch="-9 and 9",
+    name="temporal opacity of any width",
+    breaks="s / w is 0/0 where the width has underflowed, at a logarithm of -104 "
+    "(-745 in f64).",
+    formula="exp(-(s e^-w)²) is computed, with the logarithm of the width clamped to "
+    "±9",
+    switch="switch at -9 and 9",
     axis="logarithm of the width, videos",
     at=_WIDTHS[:, 1],
     points=_WIDTHS,
@@ -80,10 +82,11 @@ VISIBLE = Case(
 
 _PLACES = np.array([0.0, 0.5, 1 - 2.0**-20, 1.0, 1 + 2.0**-20, 1.5, 1e6])
 UNREST = Case(
-    name="distance of a plane of time from one",
-    breaks="planes start at one, where |1 - p| has the gradient 1: all go the same way",
-    formula="(p - 1) sign(p - 1), whose gradient there is 0",
-    switch="1",
+    name="L1 distance of time planes from one",
+    breaks="Planes start at one, where |1 - p| has the gradient 1, and all features "
+    "move the same way.",
+    formula="(p - 1) sign(p - 1) is used, whose gradient there is 0",
+    switch="switch at 1",
     axis="feature",
     at=_PLACES,
     stable=lambda x: planes.l1_time_planes(x[None, None])[None],
@@ -122,10 +125,10 @@ def _exact_shares(x):
 
 
 SHARES = Case(
-    name="nodes far from what they carry",
-    breaks="exp(-d²/2r²) over their sum is 0/0 from 13 radii (38) on",
-    formula="softmax of -d² e^-2l / 2, l = log r clamped to -20 .. 15",
-    switch="-20 and 15",
+    name="skinning weights far from the nodes",
+    breaks="exp(-d²/2r²) over its sum is 0/0 from 13 radii on (38 in f64).",
+    formula="softmax of -d² e^-2l / 2 is used, with l = log r clamped to -20 .. 15",
+    switch="switch at -20 and 15",
     axis="distance, in distances of nodes",
     at=np.repeat(_AWAY, len(_RADII)),
     points=np.array([[distance, radius] for distance in _AWAY for radius in _RADII]),
@@ -158,10 +161,11 @@ def _exact_bits(x):
 
 
 BITS = Case(
-    name="bits of what a law does not expect",
-    breaks="the difference of two shares is 0, and -log2 of it infinite, from 5.5 on",
-    formula="logarithms of the shares on the thin side; over small steps a parabola",
-    switch="a step of 0.002 deviations",
+    name="bit rate of unlikely values",
+    breaks="The difference of two probabilities is 0 from 5.5 deviations on, and its "
+    "-log2 is infinite.",
+    formula="Log probabilities in the tail are used, and a parabola for small steps",
+    switch="switch at a step of 0.002 deviations",
     axis="distance, deviations",
     at=np.repeat(_FAR, len(_STEPS)),
     # Where a step is wide, from its end on.

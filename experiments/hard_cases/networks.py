@@ -53,9 +53,11 @@ _PLACES = np.array(
 )
 OUTSIDE = Case(
     name="KAN input outside its grid",
-    breaks="kernels are 1e-11 five spacings outside: value and gradient vanish",
-    formula="clamped to w/√2 beyond the end by 1 - 1/√(1 + 2e + 3e²)",
-    switch="the ends of the grid",
+    breaks="Kernels are 1e-11 five spacings outside the grid, so value and gradient "
+    "vanish.",
+    formula="Inputs outside are clamped smoothly to the end plus w/√2 times 1 - "
+    "1/√(1 + 2e + 3e²)",
+    switch="switch at the ends of the grid",
     axis="x, grid 0 to 7",
     at=_PLACES,
     stable=lambda x: _edge(EDGE, x),
@@ -80,8 +82,8 @@ def _expand(x):
 _OFFSETS = 1024 + np.array([0, 1e-3, 0.25, 1, 3.3, 6.75, 7])
 FAR_AWAY = Case(
     name="KAN grid far from zero",
-    breaks="x² - 2xμ + μ² cancels",
-    formula="the square of the difference",
+    breaks="x² - 2xμ + μ² cancels.",
+    formula="The difference is squared",
     axis="x",
     at=_OFFSETS,
     stable=lambda x: _edge(FAR_EDGE, x),
@@ -126,9 +128,10 @@ _WIDTHS = np.array(
 )
 WIDTH = Case(
     name="KAN kernel of a trained width",
-    breaks="(x - μ)² over a squared width: 0/0 below 1e-20, gradients before",
-    formula="((x - μ) e^-s)², s clamped to ±10 of its start",
-    switch="s = ±10",
+    breaks="(x - μ)² over a squared width is 0/0 for widths below 1e-20, and its "
+    "gradients fail earlier.",
+    formula="((x - μ) e^-s)² is computed, with s clamped to ±10 of its initial value",
+    switch="switch at s = ±10",
     axis="s, the width's logarithm",
     at=_WIDTHS[:, 1],
     points=_WIDTHS,
@@ -173,9 +176,10 @@ def _exact_standardized(x):
 # Powers of two, so that what is standardized is exact in float32.
 _SPREADS = np.array([0, 2.0**-13, 2.0**-12, 2.0**-10, 2.0**-7, 0.125, 1, 16])
 NORM = Case(
-    name="KAN features of little spread",
-    breaks="mean square less squared mean: no digit left, or a negative variance",
-    formula="mean square of what is centered, + 1e-6",
+    name="KAN features of small variance",
+    breaks="The mean square minus the squared mean has no digits left, or is a "
+    "negative variance.",
+    formula="The mean square of the centered features is computed, plus 1e-6",
     axis="spread about 64",
     at=_SPREADS,
     stable=_standardize,
@@ -206,10 +210,12 @@ _FROM_KNOT = np.array(
     [-1.999, -1.5, -1, -0.25, 0.5, *sides(1.0), 1.25, 1.9, 1.99, 1.999]
 )
 SPLINE = Case(
-    name="cubic B-spline where it ends",
-    breaks="a sum of truncated cubes cancels: noise of 1e-6 where the spline is 1e-10",
-    formula="2/3 - x² + |x|³/2 within an interval of the middle knot, (2 - |x|)³/6",
-    switch="|x| = 1",
+    name="cubic B-spline near the end of its support",
+    breaks="A sum of truncated cubes cancels. Its noise is 1e-6 where the spline is "
+    "1e-10.",
+    formula="2/3 - x² + |x|³/2 is used within an interval of the middle knot, and (2 "
+    "- |x|)³/6 beyond",
+    switch="switch at |x| = 1",
     axis="x in intervals",
     at=_FROM_KNOT,
     stable=bsplines.cubic,
@@ -241,9 +247,11 @@ _UPDATES = np.array(
 )
 LENGTH = Case(
     name="length of RAdam's second moment",
-    breaks="2/(1 - b) - 1 - 2tb^t/(1 - b^t): 0.03 off at t = 5, where RAdam decides",
-    formula="t - (2/L)(h(tL/2) - h(L/2)), h(x) = x coth x - 1 by its series",
-    switch="t = 999.5",
+    breaks="2/(1 - b) - 1 - 2tb^t/(1 - b^t) is off by 0.03 at t = 5, where RAdam "
+    "decides about rectification.",
+    formula="t - (2/L)(h(tL/2) - h(L/2)) is used, with h(x) = x coth x - 1 by its "
+    "series",
+    switch="switch to a closed form at t = 999.5",
     axis="updates",
     at=_UPDATES,
     stable=lambda x: optimizer.moment_length(x, B2),
@@ -282,9 +290,10 @@ def _exact_update(x):
 
 _AGES = np.array([[n, 1e-3] for n in (1, 2, 3, 5, 10, 100, 1000, 1e5)])
 NEWBORN = Case(
-    name="Adam's update of a newborn row",
-    breaks="one count for all, here 1000 older: 2.5 to 4.6 times too fast",
-    formula="a count for each row",
+    name="Adam's update of a new Gaussian",
+    breaks="With one shared step count, here 1000 higher, updates are 2.5 to 4.6 "
+    "times too large.",
+    formula="Each Gaussian has its own step count",
     axis="updates since birth",
     at=_AGES[:, 0],
     points=_AGES,
@@ -297,8 +306,9 @@ NEWBORN = Case(
 
 BIAS = NEWBORN._replace(
     name="bias of Adam's moments",
-    breaks="1 - bⁿ cancels for the first updates: 1.5e-5; eps 1e-8",
-    formula="-expm1(n log b), eps 1e-15",
+    breaks="1 - bⁿ cancels in the first updates, with an error of 1.5e-5, and eps is "
+    "1e-8.",
+    formula="-expm1(n log b) and eps 1e-15 are used",
     textbook=lambda x: _update_at(x[:1], x),
     bounds={"float32": (1e-6,), "float64": (2e-15,)},
 )
@@ -308,8 +318,9 @@ _SLOPES = np.array(
 )
 SIZE = NEWBORN._replace(
     name="Adam's update for a gradient of any size",
-    breaks="eps 1e-8 halves the step where gradients are 1e-8; 1e-3 of it at 1e-11",
-    formula="eps 1e-15",
+    breaks="eps 1e-8 halves the update for gradients of 1e-8. For 1e-11 it is 1e-3 "
+    "of a full one.",
+    formula="eps 1e-15 is used",
     axis="gradient",
     at=_SLOPES[:, 1],
     points=_SLOPES,

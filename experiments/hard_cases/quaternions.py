@@ -41,9 +41,11 @@ _FLAT = [np.pi - 1e-3, np.pi - 1e-6, np.pi + 1e-6, np.pi + 1e-3]
 _BOTH = np.array([*_NEAR, *_FLAT, 4, 2 * np.pi - 1e-3])
 LOGARITHM = Case(
     name="logarithm of a quaternion",
-    breaks="arccos w has no digits left at w = 1, and sin θ/2 is 0 there",
-    formula="arctan2(|v|, w) / |v| for w >= 0; a series in |v|²/w²",
-    switch=f"tan²(θ/2) = {quaternion.SERIES_BELOW:g}; sign of w at π",
+    breaks="arccos w has no digits left at w = 1, where sin θ/2 is 0.",
+    formula="arctan2(|v|, w) / |v| is used for w >= 0, and a series in |v|²/w² for "
+    "small angles",
+    switch=f"switch at tan²(θ/2) = {quaternion.SERIES_BELOW:g}, and at π, where w "
+    "changes sign",
     axis="θ / rad",
     at=_BOTH,
     points=_half_turns(_BOTH),
@@ -79,9 +81,10 @@ _TO_FLAT = [1e-20, 1e-8, 1e-4, 1e-2, *_SEAM, 1.5, 3]
 _ROUND = np.array([*_TO_FLAT, np.pi - 1e-5, np.pi + 1e-5, 4])
 MATRIX_LOGARITHM = Case(
     name="logarithm of a rotation matrix",
-    breaks="arccos of the trace: no digits at 0, and none at π, where R = Rᵀ as well",
-    formula="the quaternion with the largest pivot, then its logarithm",
-    switch="largest pivot",
+    breaks="arccos of the trace has no digits at 0 and π, and at π, where R = Rᵀ, "
+    "the axis is lost.",
+    formula="The quaternion is computed with the largest pivot, and then its logarithm",
+    switch="switch where another pivot is the largest",
     axis="θ / rad",
     at=_ROUND,
     along=AXIS,
@@ -119,10 +122,11 @@ def _exact_matrix(q):
 _LENGTHS = np.array([0, 1e-18, 1e-15, 1e-10, 1e-3, 1, 1e3, 1e10, 1e15, 1e30, 2e38])
 LENGTH = Case(
     name="rotation matrix of q of any length",
-    breaks="0/0 at 0; |q|³ in the curvature underflows from 1e-13 down",
-    formula="scaled by a power of two without derivative, then normalized; identity "
-    "at zero and infinity",
-    switch="largest component 1.2e-38",
+    breaks="Normalization is 0/0 at 0, and |q|³ in the curvature underflows from "
+    "1e-13 down.",
+    formula="q is scaled by a power of two without derivative and normalized, and "
+    "zero and infinity give the identity",
+    switch="switch at a largest component of 1.2e-38",
     axis="|q|",
     at=_LENGTHS,
     along=_half_turns([2.0]),
@@ -172,9 +176,11 @@ def _exact_slerp(w):
 _APART = np.array([0, 1e-20, 1e-8, 1e-4, 1e-3, 0.1, *_SEAM, 1, 3, np.pi + 1e-3, 5])
 SLERP = Case(
     name="slerp between close quaternions",
-    breaks="sin of a share over the sine of the whole, of an arccos that lost it",
-    formula="exponential of a share of the logarithm",
-    switch=f"tan²(θ/2) = {quaternion.SERIES_BELOW:g}; shorter way from π on",
+    breaks="Sines of fractions of the angle are divided by its sine, and arccos has "
+    "lost the angle.",
+    formula="The exponential of a fraction of the logarithm is used",
+    switch=f"switch at tan²(θ/2) = {quaternion.SERIES_BELOW:g}, and at π to the "
+    "shorter arc",
     axis="θ between / rad",
     at=_APART,
     along=AXIS,

@@ -70,9 +70,9 @@ def summary(rows) -> str:
 def table(rows) -> str:
     """Format the table of docs/numerics.md."""
     lines = [
-        "| case | what breaks in the textbook form | formula used; switch | worst "
-        "error f32: textbook → ours | f64 | time of ours / textbook: value, gradient "
-        "| test |",
+        "| case | failure of the textbook formula | formula used and switch point | "
+        "worst error in f32: textbook → ours | in f64: textbook → ours | cost: ours / "
+        "textbook for value, gradient | test |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -92,7 +92,7 @@ def table(rows) -> str:
 
 def _errors(outcome):
     if outcome is None:
-        return "not held"
+        return "not measured"
     return "; ".join(
         f"{name} {number(theirs)} → {number(ours)}"
         for name, ours, theirs in zip(ORDERS, *outcome, strict=False)
@@ -121,8 +121,8 @@ def renew(path, rows) -> None:
     machine = clock.machine()
     about = (
         f"Measured with JAX {machine['jax']} on {machine['cpu']}, "
-        f"{machine['xla_cores'] or machine['cores']} core(s): processor time of "
-        "interleaved calls in float32."
+        f"{machine['xla_cores'] or machine['cores']} core(s). Costs are ratios "
+        "of processor times of interleaved calls in float32."
     )
     with replaced_file(path) as file:
         file.write_text(f"{before}\n{about}\n\n{table(rows)}\n\n{behind}")

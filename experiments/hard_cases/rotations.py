@@ -50,9 +50,10 @@ _ANGLES = np.array([*_NEAR, *_SEAM, 3.1, np.pi, 4, 2 * np.pi, 10])
 
 SCREW = Case(
     name="screw near zero",
-    breaks="Rodrigues' quotients: 0/0 at zero, their derivatives cancel below 1e-2",
-    formula="Stumpff functions of |w|², no division by the angle",
-    switch=f"|w|² = {SERIES_BELOW:g}",
+    breaks="Rodrigues' quotients are 0/0 at zero, and their derivatives cancel below "
+    "1e-2 rad.",
+    formula="Stumpff functions of |w|² are used, without division by the angle",
+    switch=f"series below |w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_ANGLES,
     along=AXIS,
@@ -130,10 +131,11 @@ def _screws(turns, speeds):
 
 _TURNS = np.array([1e-30, 1e-12, 1e-8, 1e-5, 1e-3, 1e-2, 0.3, *_SEAM, 4])
 TURN = Case(
-    name="displacement by a small turn",
-    breaks="R x - x cancels, and 1 - cos θ with it",
-    formula="w x (...) of Stumpff functions, the point never added",
-    switch=f"|w|² = {SERIES_BELOW:g}",
+    name="displacement by a small rotation",
+    breaks="R x - x cancels, and so does 1 - cos θ.",
+    formula="w x (...) is computed with Stumpff functions, and the point is never "
+    "added",
+    switch=f"series below |w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TURNS,
     points=_screws(_TURNS, 0.0),
@@ -146,9 +148,10 @@ TURN = Case(
 
 _SPEEDS = np.array([0, 1e-20, 1e-8, 1e-4, 1e-2, 1, 1e3, 1e6])
 SHIFT = Case(
-    name="translation beside a turn of 1e-4",
-    breaks="gradients of the turn are those of 1 - cos θ over θ², and grow with |v|",
-    formula="Stumpff functions of |w|²; v enters linearly",
+    name="translation with a rotation of 1e-4 rad",
+    breaks="Gradients with respect to the rotation come from (1 - cos θ)/θ², which "
+    "cancels, and grow with |v|.",
+    formula="Stumpff functions of |w|² are used, and v enters linearly",
     axis="speed / scene units",
     at=_SPEEDS,
     points=_screws(1e-4, _SPEEDS),
@@ -182,9 +185,9 @@ def _exact_inverse_jacobian(w):
 _TO_TURN = np.array([0, 1e-20, 1e-8, 1e-4, 1e-3, 1e-2, 0.3, *_SEAM, 4, 5, 6])
 INVERSE_JACOBIAN = Case(
     name="inverse left Jacobian",
-    breaks="1 - θ/2 cot θ/2 cancels, over θ²",
-    formula="(c3 - 2 c4) / (2 c2) of Stumpff functions",
-    switch=f"|w|² = {SERIES_BELOW:g}",
+    breaks="1 - θ/2 cot θ/2 cancels and is divided by θ².",
+    formula="(c3 - 2 c4) / (2 c2) is computed from Stumpff functions",
+    switch=f"series below |w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TO_TURN,
     along=AXIS,
@@ -244,10 +247,10 @@ def _exact_coupling(w):
 
 _TO_HALF = np.array([0, 1e-12, 1e-6, 1e-3, 1e-2, 0.1, 0.5, 1, *_SEAM, np.pi, 6])
 COUPLING = Case(
-    name="how translation follows a turn",
-    breaks="Barfoot's quotients by θ⁴ and θ⁵ cancel from 0.5 rad down",
-    formula="Stumpff functions c3, c4, c5",
-    switch=f"|w|² = {SERIES_BELOW:g}",
+    name="translation block of the SE(3) left Jacobian",
+    breaks="Barfoot's quotients by θ⁴ and θ⁵ cancel from 0.5 rad down.",
+    formula="The Stumpff functions c3, c4 and c5 are used",
+    switch=f"series below |w|² = {SERIES_BELOW:g}",
     axis="θ / rad",
     at=_TO_HALF,
     along=AXIS,

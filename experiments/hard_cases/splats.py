@@ -99,10 +99,12 @@ _SEEN = [_CUT * (1 - NEAR), _CUT * (1 + 1e-4), 0.01, 0.1, 0.5, 0.9]
 _ALPHAS = np.array([*_SEEN, _MOST * (1 - NEAR), _MOST * (1 + NEAR), 1.0])
 
 LONG_LIST = Case(
-    name=f"a pixel behind {COUNT} Gaussians",
-    breaks="T / (1 - alpha) of a transmittance that is 0 (126 times 0.5 in f32)",
-    formula="front to back in both passes; what is behind is a running difference",
-    switch="alpha = 1/255 (cut) and 0.99 (clamp)",
+    name=f"pixel behind {COUNT} Gaussians",
+    breaks="The backward pass computes T / (1 - alpha) from a transmittance of 0 "
+    "(126 times 0.5 in f32).",
+    formula="Both passes go front to back, and the color behind is a running "
+    "difference",
+    switch="switch at alpha = 1/255 (threshold) and 0.99 (clamp)",
     axis="alpha",
     at=_ALPHAS,
     points=np.stack([np.full(len(_ALPHAS), 0.25), _ALPHAS], axis=1),
@@ -133,9 +135,11 @@ def _exact_halved(logit):
 
 HALVED = Case(
     name="halved opacity",
-    breaks="1 - o is 0 from a logit of 17 (37), 1 - √(1 - o) below -17",
-    formula="h = log_sigmoid(-l) / 2, logit log(-expm1(h)) - h; series below",
-    switch="logit -20",
+    breaks="1 - o is 0 from a logit of 17 on (37 in f64), and 1 - √(1 - o) is 0 "
+    "below -17.",
+    formula="The logit is log(-expm1(h)) - h with h = log_sigmoid(-l) / 2, and a "
+    "series for small l",
+    switch="switch at a logit of -20",
     axis="logit",
     at=_LOGITS,
     stable=densification.halve_opacity,
@@ -172,9 +176,9 @@ def _exact_variance(log_scale):
 
 LOG_SCALE = Case(
     name="variance of a log-scale",
-    breaks="exp(s)² is infinite from 45 (355), and its gradient NaN",
-    formula="exp(clip(s, -20, 15)); no gradient outside",
-    switch="-20 and 15",
+    breaks="exp(s)² is infinite from s = 45 on (355 in f64), and its gradient is NaN.",
+    formula="exp(clip(s, -20, 15)) is used, without gradient outside",
+    switch="switch at -20 and 15",
     axis="log-scale",
     at=_LOGS,
     stable=_variance,
@@ -226,8 +230,10 @@ def _exact_spread(opacity):
 
 RELOCATION = Case(
     name=f"relocation to {COPIES} copies",
-    breaks="alternating binomials of 1e10; 1 - (1 - o)^(1/n)",
-    formula="integral of what n copies cover, all terms positive; expm1, log1p",
+    breaks="Alternating binomial coefficients of 1e10 cancel, and so does 1 - (1 - "
+    "o)^(1/n).",
+    formula="The composite of n copies is integrated with positive terms only, by "
+    "expm1 and log1p",
     axis="opacity",
     at=_OPACITIES,
     stable=_spread,
@@ -260,8 +266,9 @@ _FROM, _MOVE = np.array([10.3, -20.7, 5.1]), np.array([0.6, -0.3, 0.5])
 
 ACCELERATION = Case(
     name="acceleration of a slow motion",
-    breaks="p₊ + p₋ - 2p: the sum rounds before it cancels",
-    formula="(p₊ - p) - (p - p₋), each exact for close places",
+    breaks="The sum in p₊ + p₋ - 2p is rounded before it cancels.",
+    formula="(p₊ - p) - (p - p₋) is computed, whose differences are exact for close "
+    "positions",
     axis="scene units per interval",
     at=_SPEEDS,
     points=np.concatenate(

@@ -31,9 +31,10 @@ def _exact_weights(depth):
 
 
 WEIGHTS = Case(
-    name="weights from thin air to walls",
-    breaks="1 - exp(-d) is 0 below d = 6e-8: a ray through thin air weighs nothing",
-    formula="-expm1(-d) exp(-sum of the depths before)",
+    name="rendering weights of thin and opaque samples",
+    breaks="1 - exp(-d) is 0 below d = 6e-8, so a ray through a thin medium has no "
+    "weight.",
+    formula="-expm1(-d) exp(-sum of the optical depths before) is computed",
     axis="depth of a sample",
     **_times([1e-30, 1e-12, 1e-8, 1e-4, 0.01, 0.3, 1, 5, 16, 30, 1e3], [1, 0.5, 2, 1]),
     stable=compositing.weights,
@@ -56,9 +57,9 @@ def _exact_direction(vector):
 
 
 NORMALS = Case(
-    name="normals where density is next to level",
-    breaks="the square of a gradient of 1e-24 is 0 and of 1e20 infinite",
-    formula="divided by the largest entry first",
+    name="normals from tiny and huge density gradients",
+    breaks="The square of a gradient of 1e-24 is 0, and that of 1e20 is infinite.",
+    formula="The gradient is divided by its largest entry first",
     axis="length of the gradient",
     **_times([1e-24, 1e-22, 1e-6, 1, 1e10, 1e20, 1e30], [0.5, -1, 0.25]),
     stable=surface.unit,
@@ -92,8 +93,8 @@ def _exact_closed(density):
 
 LAST = Case(
     name="last interval of 1e10",
-    breaks="cumsum(d) - d swallows the depths in front: weights sum to 1.6",
-    formula="sum of the samples before, without the sample itself",
+    breaks="cumsum(d) - d loses the optical depths in front, and weights sum to 1.6.",
+    formula="The sum over the samples before is computed without the sample itself",
     axis="density",
     **_times([1e-20, 1e-14, 1e-11, 1e-10, 1e-4, 0.1, 1, 10, 1e3], [1, 1, 0.5, 2, 1]),
     stable=_closed_by_infinity,
@@ -130,9 +131,9 @@ def _exact_expected(weights):
 _EDGE = EMPTY_BELOW / 4
 DISTANCE = Case(
     name="expected distance of an empty ray",
-    breaks="0/0, and a gradient that grows as 1/opacity",
-    formula="opacity below 1e-3 is filled up at the far end",
-    switch="opacity 1e-3",
+    breaks="The distance is 0/0, and its gradient grows as 1/opacity.",
+    formula="The opacity missing to 1e-3 is added at the far end",
+    switch="switch at an opacity of 1e-3",
     axis="opacity / 4",
     **_times(
         [
@@ -187,10 +188,11 @@ _THINNED = np.array(
 )
 _THINNED = _THINNED[np.argsort(_THINNED[:, 0], kind="stable")]
 THINNED = Case(
-    name="opacity times a share",
-    breaks="-log(1 - v(1 - exp(-d))): infinite for v → 1, 0 in thin air",
-    formula="-log1p(v expm1(-d)); -logaddexp(log(1 - v), log v - d) for walls",
-    switch=f"opacity {THIN_BELOW:g}",
+    name="opacity times a blending weight",
+    breaks="-log(1 - v(1 - exp(-d))) is infinite for v → 1, and 0 in a thin medium.",
+    formula="-log1p(v expm1(-d)) is used for thin samples, and -logaddexp(log(1 - "
+    "v), log v - d) for opaque ones",
+    switch=f"switch at an opacity of {THIN_BELOW:g}",
     axis="depth",
     at=_THINNED[:, 0],
     points=_THINNED,
@@ -268,11 +270,12 @@ _DRAWS = [
     (1.6e38, _UNEVEN),
 ]
 SAMPLES = Case(
-    name="samples where light stops",
-    breaks="a floor of 1e-5 on all weights drowns faint ones: 0.4 of the range off",
-    formula="scaled by the largest in two steps, floor of a rounding unit, running "
-    "maximum",
-    switch="largest weight 1.2e-38, none",
+    name="importance sampling by faint weights",
+    breaks="1e-5, added to all weights, dominates faint ones. Samples are off by 0.4 "
+    "of the range.",
+    formula="Weights are scaled by the largest in two steps, one rounding unit is "
+    "added, and above 65 bins a running maximum keeps sums sorted",
+    switch="switch to equal weights below a largest weight of 1.2e-38",
     axis="size of the weights",
     at=np.array([size for size, _ in _DRAWS]),
     points=np.array([size * pattern for size, pattern in _DRAWS]),

@@ -61,15 +61,17 @@ def test_the_command_measures_prints_and_renews_the_page(tmp_path, capsys):
     words += ["--repeats", "1", "--out", str(out), "--document", str(page)]
     hard_cases.main(words)
     printed = capsys.readouterr().out
-    assert "window of a band that opens" in printed
+    assert "coarse-to-fine window of a band" in printed
     assert "1 of 1 textbook forms" in printed
     text = page.read_text()
     assert text.startswith("before\n")
     assert text.endswith("behind\n")
     assert "old" not in text
-    assert "test_encoding_cases.py::test_held[window of a band that opens-…]" in text
+    assert (
+        "test_encoding_cases.py::test_held[coarse-to-fine window of a band-…]" in text
+    )
     stored = json.loads((out / "hard_cases.json").read_text())["metrics"]
-    key = "window_of_a_band_that_opens.float32.gradient"
+    key = "coarse-to-fine_window_of_a_band.float32.gradient"
     assert stored[f"{key}.ours"]["value"] < 1e-5 < stored[f"{key}.textbook"]["value"]
 
 
