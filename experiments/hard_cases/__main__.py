@@ -6,7 +6,7 @@
 
 Every case sweeps a function to its singular point. The table shows the largest errors
 of value, gradient and curvature of the textbook form and of the stable one compared
-with 60-digit arithmetic, in float32 and float64, and the ratio of their times for
+with 120-digit arithmetic, in float32 and float64, and the ratio of their times for
 values and for gradients, from interleaved calls over many inputs away from the singular
 point. Writes hard_cases.json.
 """

@@ -1,7 +1,7 @@
 """Hard cases, and the error of a formula on them.
 
 A case sweeps a function to the point where its textbook form loses digits, and compares
-both forms with 60-digit arithmetic: value, gradient and, if anything differentiates
+both forms with 120-digit arithmetic: value, gradient and, if anything differentiates
 twice, curvature. `hard_cases` prints the table, and tests check the bounds.
 """
 

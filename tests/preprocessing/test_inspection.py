@@ -67,12 +67,13 @@ def test_cameras_that_take_turns_see_what_one_camera_sees():
 )
 def test_what_points_at_rest_are_off_by_weakens_both_answers(share, noise_px, answer):
     inspected = still()
-    tracks, rest = inspected.evidence.tracks, inspected.evidence.static_fit
+    tracks, static_fit = inspected.evidence.tracks, inspected.evidence.static_fit
     length = tracks.visible.sum(1)
     moves = np.cumsum(length) <= share * length.sum()
     residual = np.where(tracks.visible, noise_px, np.nan)
     evidence = inspected.evidence._replace(
-        score=moves.astype(float), rest=rest._replace(residual=residual)
+        score=moves.astype(float),
+        static_fit=static_fit._replace(residual=residual),
     )
     finding = motion.motion(inspected.views, evidence)
     assert (finding.wanted, finding.confidence) == answer
