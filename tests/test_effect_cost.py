@@ -234,7 +234,7 @@ def of_motion(preset, *rest):
 
 INNER = {
     "rate": of_motion(
-        "adc-gs", {"rate": None}, entropy, ("noisy", "rounded", "bits"), (".law",)
+        "adc-gs", {"rate": None}, entropy, ("noisy", "quantize", "bits"), (".law",)
     ),
     "moves": of_motion(
         "adc-gs",
