@@ -40,11 +40,11 @@ DOUBTFULLY_TOLD = 0.02
 # they are not parts of an object: those of the squashed ball have scales that differ by
 # 8 %.
 BADLY_TOLD, MOST_OF_OBJECT = 0.05, 0.7
-# Logarithm of the likelihood ratio from which the factor of a rigid body is applied: 95
-# % confidence (Wilks 1938, one degree of freedom). Rigid objects of the built-in scenes
-# whose paths are 0 to 1.2 % from the true distance have 0 to 1, with factors that are
-# wrong by up to 3.7 %, and shutters that are 4 % from it have 8 to 13. That of the
-# squashed ball, 5 % from it, is below 0.5.
+# Logarithm of the likelihood ratio from which the factor of a rigid body is applied.
+# The confidence is 95 % (Wilks 1938, one degree of freedom). Rigid objects of the
+# built-in scenes whose paths are 0 to 1.2 % from the true distance have 0 to 1, with
+# factors that are wrong by up to 3.7 %, and shutters that are 4 % from it have 8 to 13.
+# That of the squashed ball, 5 % from it, is below 0.5.
 LEAST_NATS = 2.0
 # Weight of second differences of the poses of a body in 60 frames. It grows with the
 # square of the number of frames, so that a motion costs the same at any frame rate.
@@ -302,7 +302,7 @@ def _grow(views, tracks, paths, own, rows, within, has_room):
             break
         own = rows[fits]
         whole = whole._replace(point=whole.point[fits])
-        paths = _at_scale_of(views, paths, own, whole, there)
+        paths = _rescale_paths(views, paths, own, whole, there)
     if body is None:
         return None
     body, miss = _on(views, tracks, paths, body, rows, there)
@@ -313,19 +313,18 @@ def _grow(views, tracks, paths, own, rows, within, has_room):
     return rows[fits], body._replace(point=body.point[fits]), error_px
 
 
-def _at_scale_of(views, paths, own, body, there):
-    """Return paths of which those on a body are scaled to its depth in some frames.
+def _rescale_paths(views, paths, own, body, there):
+    """Scale the paths on a body to its depth in the frames `there`.
 
     Paths of different scales initialize parts of an object that do not fit together,
     which the robust loss would accept.
     """
-    known = paths.known[own] & there
-    ratio = np.where(known, views.depth_of(body.world()) / paths.depth[own], np.nan)
+    common_depth = np.where(paths.known[own] & there, paths.depth[own], np.nan)
+    ratio = views.depth_of(body.world()) / common_depth
     factor = np.nanmedian(ratio, axis=1)[:, None]
     position, depth = paths.position.copy(), paths.depth.copy()
-    position[own] = views.position + factor[..., None] * (
-        position[own] - views.position
-    )
+    offset = position[own] - views.position
+    position[own] = views.position + factor[..., None] * offset
     depth[own] *= factor
     return paths._replace(position=position, depth=depth)
 
@@ -379,10 +378,11 @@ def _on(views, tracks, paths, body, rows, there, least_known=LEAST_KNOWN):
         rotation=views.rotation @ body.rotation,
         position=np.einsum("fij,fj->fi", turn, views.position - body.shift),
     )
-    known_tracks = tracks.take(rows)._replace(visible=is_known)
+    tracks = tracks.take(rows)
+    known_tracks = tracks._replace(visible=is_known)
     point = static_points.fit(relative, known_tracks).position
     point[~enough] = 0.0
-    sight = bundle.sight(views, tracks.take(rows), is_known & enough[:, None])
+    sight = bundle.sight(views, tracks, is_known & enough[:, None])
     whole = bundle.placed(views, sight, body._replace(point=point))
     miss = bundle.misses(views, sight, whole)
     return whole, bundle.typical_misses(sight, miss, len(rows))
