@@ -19,7 +19,6 @@ from nerfies_jax.evaluation.frames import resized, view_of
 from nerfies_jax.evaluation.scores import Draw, Scored, score
 from nerfies_jax.geometry.camera import Camera, move
 from nerfies_jax.training import fit, losses
-from nerfies_jax.training.fit import Fit
 from nerfies_jax.training.model import Model, TrainState, View, in_default_precision
 
 LEVELS = 255.0  # of an 8-bit image, the unit of the error
@@ -89,32 +88,6 @@ def photometric_loss(
     return loss
 
 
-def _fit_camera(
-    model: Model,
-    state: TrainState,
-    view: View,
-    image: UInt8[Array, "height width 3"],
-    valid: Bool[Array, "height width"] | None,
-    depth: Float[Array, ""],
-    spec: CameraFitSpec = CameraFitSpec(),
-) -> Fit:
-    """Refine the camera of a view so that its rendering matches an image.
-
-    `residual` is the norm of the gradient in squared gray levels per pixel. An image
-    that does not depend on the camera never converges.
-    """
-    loss = photometric_loss(model, state, view, image, valid, depth)
-    start = jnp.zeros(6, view.camera.position.dtype)
-    solution = fit.fit_code(
-        loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
-    )
-    return solution._replace(
-        value=_move_camera(view.camera, solution.value, depth),
-        # Rounding errors keep the gradient of a real image from being exactly zero.
-        converged=solution.converged & (solution.residual > 0),
-    )
-
-
 def fit_cameras(
     model: Model,
     draw: Draw,
@@ -146,17 +119,20 @@ def fit_cameras(
     size = width // factor, height // factor
     # The smaller image does not contain the remaining pixels at the right and bottom.
     crop_size = size[0] * factor, size[1] * factor
-    program = jax.jit(
-        lambda params, step, view, image, valid, depth: _fit_camera(
-            model,
-            state._replace(params=params, step=step),
-            view,
-            image,
-            valid,
-            depth,
-            spec,
+
+    @jax.jit
+    def fit_camera(params, step, view, image, valid, depth):
+        at_step = state._replace(params=params, step=step)
+        loss = photometric_loss(model, at_step, view, image, valid, depth)
+        start = jnp.zeros(6, view.camera.position.dtype)
+        solution = fit.fit_code(
+            loss, start, max_steps=spec.max_steps, tolerance=spec.tolerance
         )
-    )
+        camera = _move_camera(view.camera, solution.value, depth)
+        # Rounding errors keep the gradient of a real image from being exactly zero, so
+        # an image that does not depend on the camera never converges.
+        return camera, solution.converged & (solution.residual > 0)
+
     depth = in_default_precision(np.float32(2 / (1 / capture.near + 1 / capture.far)))
     cameras, convergence = [], []
     for row in rows:
@@ -164,7 +140,7 @@ def fit_cameras(
         valid = None
         if capture.valid is not None:
             valid = jnp.asarray(blocks(capture.valid[row], factor).all((-3, -1)))
-        solution = program(
+        camera, converged = fit_camera(
             state.params,
             state.step,
             resized(view, crop_size, size),
@@ -174,11 +150,10 @@ def fit_cameras(
         )
         cameras.append(
             view.camera._replace(
-                camera_from_world=solution.value.camera_from_world,
-                position=solution.value.position,
+                camera_from_world=camera.camera_from_world, position=camera.position
             )
         )
-        convergence.append(bool(solution.converged))
+        convergence.append(bool(converged))
     batch = jax.tree.map(
         lambda *leaves: np.stack([np.asarray(x, np.float32) for x in leaves]), *cameras
     )
