@@ -27,6 +27,7 @@ LEAST_ALPHA = 0.5  # of pixels that show a surface
 MOST_VIEWS = 48
 # Surfaces beyond these shares of the depth samples are background.
 BOUNDS = (0.02, 0.98)
+NO_SURFACE = "the depth of the training views shows no surface; train for more steps"
 
 
 class Mesh(NamedTuple):
@@ -86,16 +87,12 @@ def extract(
     in_view = (weight > 0).reshape(sides)
     in_view = scipy.ndimage.binary_erosion(in_view, np.ones((3, 3, 3)))
     if not ((distance < 0) & in_view).any() or not ((distance > 0) & in_view).any():
-        raise ValueError(
-            "the depth of the training views shows no surface; train for more steps"
-        )
+        raise ValueError(NO_SURFACE)
     vertices, faces, _, _ = skimage.measure.marching_cubes(
         distance, 0.0, mask=in_view, gradient_direction="descent"
     )
     if not len(faces):
-        raise ValueError(
-            "the depth of the training views shows no surface; train for more steps"
-        )
+        raise ValueError(NO_SURFACE)
     nearest = np.clip(np.rint(vertices).astype(int), 0, sides - 1)
     bytes_of = np.rint(np.clip(color[tuple(nearest.T)], 0, 1) * 255).astype(np.uint8)
     return Mesh(low + step * vertices, faces.astype(np.int32), bytes_of)
@@ -122,9 +119,7 @@ def _bounds(observations):
         points.append(model_flow.surface(observation.camera, pixels, depth))
     points = np.concatenate(points)
     if not len(points):
-        raise ValueError(
-            "the depth of the training views shows no surface; train for more steps"
-        )
+        raise ValueError(NO_SURFACE)
     low, high = np.quantile(points, BOUNDS, axis=0)
     margin = 0.05 * (high - low).max()
     return low - margin, high + margin
