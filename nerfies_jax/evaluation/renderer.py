@@ -2,8 +2,7 @@
 
 import functools
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from nerfies_jax.training import programs
 from nerfies_jax.training.model import (
     Model,
     Rendering,
+    Stages,
     Surveyed,
     TrainState,
     View,
@@ -144,14 +144,6 @@ class _Memo:
         return result, True
 
 
-class _Programs(NamedTuple):
-    """Compiled stages of a model."""
-
-    prepare: Callable
-    deform: Callable
-    draw: Callable
-
-
 def _float32(rendering):
     """Convert a rendering to float32 from any precision."""
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rendering)
@@ -206,9 +198,7 @@ def _compile_stages(model, size, inputs):
     lowered_draw = programs.Program(draw, model).lower(
         params, lowered_deform.out_info, view, step
     )
-    return _Programs(
-        *_compile_all(model, lowered_prepare, lowered_deform, lowered_draw)
-    )
+    return Stages(*_compile_all(model, lowered_prepare, lowered_deform, lowered_draw))
 
 
 def _compile_all(model, *lowered):
