@@ -59,13 +59,6 @@ TOLERANCES = {
     "tracks.drift": 0.002,
     "tracks.strain": 0.1,
 }
-_TRACKS = {
-    "track_error": "tracks.epe",
-    "track_correct": "tracks.correct",
-    "track_lost": "tracks.lost",
-    "drift": "tracks.drift",
-    "strain": "tracks.strain",
-}
 
 
 class Lpips(NamedTuple):
@@ -133,8 +126,7 @@ def heldout_metrics(
     if capture.depths is not None:
         optional_scores |= _depths(scored, capture)
     if known is not None and followed is not None:
-        numbers = protocol.score_tracks(known, followed)
-        optional_scores |= {_TRACKS[name]: value for name, value in numbers.items()}
+        optional_scores |= protocol.score_tracks(known, followed)
         optional_scores["tracks.static_epe"] = protocol.static_error(known)
     if flow is not None:
         optional_scores |= _flow(flow)

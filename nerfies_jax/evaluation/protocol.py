@@ -106,9 +106,10 @@ def score_tracks(known: GroundTruth, followed: PointTracks | None) -> dict[str, 
       followed: Predicted tracks, or None.
 
     Returns:
-      Metrics by name, NaN without tracks.
+      Metrics by the keys of `heldout.TOLERANCES`, NaN without tracks.
     """
-    names = ("track_error", "track_correct", "track_lost", "drift", "strain")
+    parts = ("epe", "correct", "lost", "drift", "strain")
+    names = [f"tracks.{part}" for part in parts]
     if followed is None or not len(known.path):
         return dict.fromkeys(names, float("nan"))
     errors = _endpoints(followed.path, known)

@@ -48,20 +48,20 @@ def test_tracks_are_scored_by_their_distance_at_all_instants_but_the_start():
     right = PointTracks(known.path, answered, 0.1, 0.2)
     later = answered[:, 1:].size  # all but one column
     numbers = protocol.score_tracks(known, right)
-    assert numbers["track_error"] == 0
-    assert numbers["track_correct"] == 1
-    assert numbers["track_lost"] == pytest.approx(2 / later)
-    assert (numbers["drift"], numbers["strain"]) == (0.1, 0.2)
+    assert numbers["tracks.epe"] == 0
+    assert numbers["tracks.correct"] == 1
+    assert numbers["tracks.lost"] == pytest.approx(2 / later)
+    assert (numbers["tracks.drift"], numbers["tracks.strain"]) == (0.1, 0.2)
     wrong = right._replace(path=known.path + SHIFT)
     numbers = protocol.score_tracks(known, wrong)
-    assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
-    assert numbers["track_correct"] == 0
+    assert numbers["tracks.epe"] == pytest.approx(0.02, rel=1e-4)
+    assert numbers["tracks.correct"] == 0
     # What cannot be seen is not scored.
     half = known.visible.copy()
     half[:, ::2] = False
     wrong.path[:, ::2] = 9.0
     numbers = protocol.score_tracks(known._replace(visible=half), wrong)
-    assert numbers["track_error"] == pytest.approx(0.02, rel=1e-4)
+    assert numbers["tracks.epe"] == pytest.approx(0.02, rel=1e-4)
     away = np.linalg.norm(known.path - known.path[:, 3:4], axis=-1)
     away = np.delete(away, 3, axis=1)
     assert protocol.static_error(known) == pytest.approx(away.mean(), rel=1e-5)

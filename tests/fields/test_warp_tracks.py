@@ -121,7 +121,7 @@ def test_points_are_followed_along_a_flow_in_closed_form(
     assert followed.converged.all()
     assert followed.drift > 0.01
     errors = protocol.score_tracks(known, followed)
-    assert 0 < errors["track_error"] != protocol.static_error(known)
+    assert 0 < errors["tracks.epe"] != protocol.static_error(known)
 
 
 def test_a_field_without_a_motion_follows_nothing(known_scene):
