@@ -68,24 +68,6 @@ class Lpips(NamedTuple):
     params: LpipsParams
 
 
-def check_large_enough(network: Network, size: tuple[int, int]) -> None:
-    """Check that images are large enough for LPIPS.
-
-    Args:
-      network: Network of LPIPS.
-      size: Width and height of the images in pixels.
-
-    Raises:
-      ValueError: If they are too small.
-    """
-    if min(size) < network.smallest:
-        raise ValueError(
-            f"LPIPS with {network.name} needs at least {network.smallest} pixels on "
-            f"the shorter side, but the images are {size[0]}x{size[1]}; remove its "
-            "weights"
-        )
-
-
 def heldout_metrics(
     scored: Scored,
     capture: Capture,

@@ -107,6 +107,24 @@ class WeightsMissing(ValueError):
     """The weights of LPIPS are missing or unusable. The message states the reason."""
 
 
+def check_large_enough(network: Network, size: tuple[int, int]) -> None:
+    """Check that images are large enough for LPIPS.
+
+    Args:
+      network: Network of LPIPS.
+      size: Width and height of the images in pixels.
+
+    Raises:
+      ValueError: If they are too small.
+    """
+    if min(size) < network.smallest:
+        raise ValueError(
+            f"LPIPS with {network.name} needs at least {network.smallest} pixels on "
+            f"the shorter side, but the images are {size[0]}x{size[1]}; remove its "
+            "weights"
+        )
+
+
 def lpips(
     params: LpipsParams,
     network: Network,
@@ -205,11 +223,7 @@ def features(
     Raises:
       ValueError: If the image is too small for the network.
     """
-    if min(image.shape[:2]) < network.smallest:
-        raise ValueError(
-            f"LPIPS with {network.name} needs {network.smallest} pixels on the shorter "
-            f"side, got {image.shape[1]}x{image.shape[0]}"
-        )
+    check_large_enough(network, (image.shape[1], image.shape[0]))
     shift, scale = (jnp.asarray(x, image.dtype) for x in (SHIFT, SCALE))
     x = ((image - shift) / scale)[None]
     convolutions = iter(params.convolutions)

@@ -77,7 +77,7 @@ def fitting(extra: Extra, size: tuple[int, int]) -> Extra:
       ValueError: If they are too small for requested metrics.
     """
     if extra.requires_lpips and extra.lpips is not None:
-        heldout.check_large_enough(extra.lpips.network, size)
+        perceptual.check_large_enough(extra.lpips.network, size)
     if extra.lpips is not None and min(size) < extra.lpips.network.smallest:
         return extra._replace(lpips=None)
     return extra

@@ -187,7 +187,7 @@ def test_large_images_get_ms_ssim_and_weights_lpips(rng, tmp_path):
     )
     assert numbers["heldout.lpips"] == pytest.approx(float(exact), rel=1e-4)
     with pytest.raises(ValueError, match="9 pixels on the shorter side"):
-        heldout.check_large_enough(TINY, (40, 8))
+        perceptual.check_large_enough(TINY, (40, 8))
 
 
 @pytest.mark.parametrize("double", [False, True])

@@ -304,5 +304,5 @@ def test_the_smallest_image_is_the_smallest(name, rng):
         ]
 
     assert min(last(size).shape[:2]) == 1
-    with pytest.raises(ValueError, match=f"needs {size} pixels"):
+    with pytest.raises(ValueError, match=f"needs at least {size} pixels"):
         last(size - 1)
