@@ -7,3 +7,10 @@ class FileError(ValueError):
 
 class CaptureError(FileError):
     """A capture that cannot be used, with a one-line message that names the remedy."""
+
+
+# Errors of code that reads parsed JSON whose keys, types or values are unexpected.
+UNEXPECTED_CONTENT = (
+    *(LookupError, TypeError, AttributeError, ValueError, ArithmeticError),
+    RecursionError,
+)

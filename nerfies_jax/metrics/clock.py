@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 
-from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.errors import UNEXPECTED_CONTENT, FileError
 from nerfies_jax.capture.json_files import read_json, write_json
 
 DIRECTIONS = ("lower", "higher", "equal")
@@ -125,13 +125,7 @@ def read_metrics(path) -> dict[str, Metric]:
         }
     except FileError:  # it names the path already
         raise
-    except (
-        LookupError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        ArithmeticError,
-    ) as error:
+    except UNEXPECTED_CONTENT as error:
         raise FileError(
             f"{path}: not a file of metrics ({error!r}); create it with write_metrics"
         ) from error

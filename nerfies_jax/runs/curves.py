@@ -8,7 +8,7 @@ import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.errors import UNEXPECTED_CONTENT, FileError
 from nerfies_jax.capture.json_files import read_json, write_json
 from nerfies_jax.metrics import clock
 from nerfies_jax.runs import event_log
@@ -213,15 +213,22 @@ def read(folder: pathlib.Path) -> Curve:
 
 
 def _curve_of(summary):
-    rows = [row for row in of_held_out(summary.evaluations) if "psnr" in row]
+    # Rows of a damaged file may lack metrics.
+    rows = [{"ssim": None, **row} for row in summary.evaluations if "psnr" in row]
+    numbers = summary.compile_seconds, summary.machine
+    return _curve(rows, summary.frames, *numbers)
+
+
+def _curve(evaluations, frames, compile_seconds, machine):
+    rows = of_held_out(evaluations)
     return Curve(
-        seconds=tuple(row["seconds"] for row in rows),
-        steps=tuple(row["step"] for row in rows),
+        seconds=tuple(float(row["seconds"]) for row in rows),
+        steps=tuple(int(row["step"]) for row in rows),
         psnr=tuple(_number(row["psnr"]) for row in rows),
-        ssim=tuple(_number(row.get("ssim")) for row in rows),
-        frames=summary.frames,
-        compile_seconds=summary.compile_seconds,
-        machine=summary.machine,
+        ssim=tuple(_number(row["ssim"]) for row in rows),
+        frames=tuple(frames),
+        compile_seconds=float(compile_seconds),
+        machine=dict(machine),
         cpu_seconds=tuple(_number(row.get("cpu_seconds")) for row in rows),
     )
 
@@ -229,26 +236,11 @@ def _curve_of(summary):
 def _stored_curve(path):
     try:
         content = read_json(path, dict[str, Any])
-        rows = of_held_out(content["evaluations"])
-        return Curve(
-            seconds=tuple(float(row["seconds"]) for row in rows),
-            steps=tuple(int(row["step"]) for row in rows),
-            psnr=tuple(_number(row["psnr"]) for row in rows),
-            ssim=tuple(_number(row["ssim"]) for row in rows),
-            frames=tuple(content["frames"]),
-            compile_seconds=float(content["compile_seconds"]),
-            machine=dict(content["machine"]),
-            cpu_seconds=tuple(_number(row.get("cpu_seconds")) for row in rows),
-        )
+        names = ("evaluations", "frames", "compile_seconds", "machine")
+        return _curve(*(content[name] for name in names))
     except FileError:  # it names the path already
         raise
-    except (
-        LookupError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        ArithmeticError,
-    ) as error:
+    except UNEXPECTED_CONTENT as error:
         raise FileError(f"{path}: not a valid curve of a run ({error!r})") from error
 
 

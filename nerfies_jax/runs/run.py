@@ -12,7 +12,7 @@ import psutil
 
 from nerfies_jax.capture import frame_memory, pinholes
 from nerfies_jax.capture.capture import Capture
-from nerfies_jax.capture.errors import FileError
+from nerfies_jax.capture.errors import UNEXPECTED_CONTENT, FileError
 from nerfies_jax.capture.json_files import read_json, write_json
 from nerfies_jax.evaluation import with_refined_cameras
 from nerfies_jax.evaluation.representation import Representation
@@ -337,13 +337,7 @@ def _readable(folder):
         yield
     except FileError:  # it names the path already
         raise
-    except (
-        LookupError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        RecursionError,
-    ) as error:
+    except UNEXPECTED_CONTENT as error:
         reason = " ".join(str(error).split())
         raise FileError(
             f"{folder / CONFIG}: not valid settings of a run ({reason})"
