@@ -57,7 +57,8 @@ def main(args):
         page = viewer.Viewer(run, size, args.port, args.run)
         course = curves.course_of(args.run)
         rows = (run_checkpoint.record or {}).get("rows", ())
-        page.add_history(rows if course is None else course.training or rows)
+        for row in rows if course is None else course.training or rows:
+            page.training.add(int(row["step"]), row)
     if course is not None and not course.ended:
         console.say(
             f"the run has not ended: {course.line()}; shown is what it saved last"

@@ -171,17 +171,6 @@ class Screen:
             self._models[without] = model
         return self._models[without]
 
-    def has_range(self, channel: str) -> bool:
-        """Test if the color range of a channel depends on the images.
-
-        Args:
-          channel: Name of the channel.
-
-        Returns:
-          True for depth and motion.
-        """
-        return channel in ("depth", "motion")
-
     def legend(self, channel: str) -> str:
         """Explain the colors of a channel.
 

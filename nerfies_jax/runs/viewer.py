@@ -10,7 +10,7 @@ import io
 import pathlib
 import queue
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -122,24 +122,6 @@ class Viewer:
         until = time.monotonic() + seconds
         while self._update(state, step) and time.monotonic() < until:
             pass
-
-    def add_metrics(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Add the metrics of a step to the curve.
-
-        Args:
-          step: The step.
-          metrics: Metrics by name.
-        """
-        self.training.add(step, metrics)
-
-    def add_history(self, rows: Sequence[Mapping[str, float]]) -> None:
-        """Add the metrics of earlier training to the curve.
-
-        Args:
-          rows: Metrics by name, with "step".
-        """
-        for row in rows:
-            self.training.add(int(row["step"]), row)
 
     def _update(self, state, step) -> bool:
         """Update each browser by a bounded amount of work. True if more is left."""
@@ -300,7 +282,7 @@ def live(run: Run, folder: pathlib.Path, port: int) -> Iterator[Hook]:
     console.say(f"live view during training: {viewer.address}")
 
     def show(state: TrainState, step: int, metrics: Mapping[str, float]) -> None:
-        viewer.add_metrics(step, metrics)
+        viewer.training.add(step, metrics)
         viewer.serve(state, step, LIVE_SECONDS)
         while viewer.holds_training and not stopping.requested():
             viewer.serve(state, step, LIVE_SECONDS)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerfies_jax.evaluation import interactive
+from nerfies_jax.evaluation import interactive, to_uint8
 from nerfies_jax.evaluation.interactive import Eye, Look
 from nerfies_jax.evaluation.representation import SplatCloud
 from nerfies_jax.runs.screen import Screen
@@ -141,7 +141,7 @@ class Window:
         return float("inf") if position is None else max(wait, CAMERA_SECONDS)
 
     def _send_splats(self, cloud: SplatCloud):
-        color = _bytes(cloud.background)
+        color = to_uint8(cloud.background)
         if self._background != tuple(color.tolist()):
             self._background = tuple(color.tolist())
             self._send_image(np.broadcast_to(color, (8, 8, 3)), format="png")
@@ -167,8 +167,8 @@ class Window:
         return (
             np.asarray(cloud.centers, np.float32) / unit,
             np.clip(covariances / unit**2, -LARGEST_HALF, LARGEST_HALF),
-            _bytes(cloud.rgb),
-            _bytes(cloud.opacity)[:, None],
+            to_uint8(cloud.rgb),
+            to_uint8(cloud.opacity)[:, None],
         )
 
     def _show_splats(self, visible):
@@ -189,7 +189,7 @@ class Window:
         moving = now - image.start_time < STATIC_SECONDS
         if not image.cells:
             seconds = self._screen.tile_seconds(look)
-            if image.complete is None and self._screen.has_range(look.channel):
+            if image.complete is None and look.channel in ("depth", "motion"):
                 seconds = None  # the coarsest image determines the range
             level = interactive.next_level(
                 seconds, pyramid.levels, image.complete, moving
@@ -265,8 +265,3 @@ class _Image:
         (column, row), (width, height) = cell, size
         top, left = row * height, column * width
         self.canvas[top : top + height, left : left + width] = tile
-
-
-def _bytes(values):
-    """Convert values in [0, 1] to 8 bits."""
-    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)

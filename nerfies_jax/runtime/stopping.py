@@ -194,15 +194,6 @@ def keeps_handlers() -> Iterator[None]:
         libc.sigaction(int(signal.SIGTERM), before, None)
 
 
-def is_installed() -> bool:
-    """Test if signals are requests in this process.
-
-    Returns:
-      True after `install`.
-    """
-    return _PROCESS is not None
-
-
 def check() -> None:
     """Raise `Stopped` if a signal has arrived that has not been handled yet."""
     process = _PROCESS
@@ -342,7 +333,7 @@ def exits() -> Iterator[None]:
     Yields:
       None.
     """
-    if is_installed():
+    if _PROCESS is not None:
         yield
         return
 
