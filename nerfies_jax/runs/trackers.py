@@ -6,11 +6,11 @@ Each is a sink of events that uses the library of the tracker (extra `log`).
 import contextlib
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from nerfies_jax.capture import extras
 from nerfies_jax.capture.nearest import known_names
-from nerfies_jax.runtime.events import Event
+from nerfies_jax.runtime.events import Event, Sink
 
 PROJECT = "nerfies-jax"
 
@@ -23,20 +23,6 @@ class TrackedRun(NamedTuple):
     name: str
     config: dict[str, Any]  # JSON values
     step: int  # after which it begins or is resumed
-
-
-class Tracker(Protocol):
-    """A sink of events that is closed at the end of a run."""
-
-    name: str
-
-    def __call__(self, event: Event) -> None:
-        """Receive an event."""
-        ...
-
-    def close(self) -> None:
-        """Write pending data."""
-        ...
 
 
 def scalars(event: Event) -> dict[str, float]:
@@ -168,7 +154,7 @@ def check(names: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def opened(name: str, run: TrackedRun) -> Iterator[Tracker]:
+def opened(name: str, run: TrackedRun) -> Iterator[Sink]:
     """Open a tracker for the duration of the block.
 
     Args:
