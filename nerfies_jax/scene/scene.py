@@ -114,7 +114,7 @@ def _model(radiance, more):
         if evidence is not None:
             paths = warp_fit.point_paths(radiance, capture, evidence)
             fit = warp_fit.fit_flow if spec.warp is None else warp_fit.fit
-            params = fit(radiance, params, paths, start_key, spec.start).params
+            params = fit(radiance, params, paths, start_key, spec.start)
         return first_state(params, run_key)
 
     def example(_, key):

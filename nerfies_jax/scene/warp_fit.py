@@ -19,7 +19,6 @@ from nerfies_jax.fields.effects import scene_flow, timestamps
 from nerfies_jax.fields.field import Field
 from nerfies_jax.preprocessing import usable_paths
 from nerfies_jax.preprocessing.record import Evidence
-from nerfies_jax.training import programs
 from nerfies_jax.training.effects import FrameCondition
 from nerfies_jax.training.model import View
 from nerfies_jax.training.track_start import TrackStartSpec
@@ -46,23 +45,6 @@ class PointPaths(NamedTuple):
     position: Float[np.ndarray, "points frames 3"]  # arbitrary if unknown
     known: Bool[np.ndarray, "points frames"]
     static: Float[np.ndarray, "static 3"]  # static points
-
-
-class WarpFit(NamedTuple):
-    """Fitted warp, and the mean distance in the template before and after the fit."""
-
-    params: PyTree  # of the whole field
-    canonical: Float[Array, "points 3"]  # positions in the template, field units
-    first: float  # field units
-    last: float
-
-
-class FlowFit(NamedTuple):
-    """Fitted scene flow, and its mean error before and after the fit."""
-
-    params: PyTree  # of the whole field
-    first: float  # field units per interval
-    last: float
 
 
 def point_paths(field: Field, capture, evidence: Evidence) -> PointPaths:
@@ -99,7 +81,7 @@ def fit(
     paths: PointPaths,
     key: Key[Array, ""],
     start: TrackStartSpec,
-) -> WarpFit:
+) -> PyTree:
     """Fit the warp by gradient descent on the spread of each point in the template.
 
     The optimized variables are the warps, the codes that they read, and the positions
@@ -114,7 +96,7 @@ def fit(
       start: Settings.
 
     Returns:
-      The fitted parameters.
+      The parameters of the whole field, with those that were fitted.
 
     Raises:
       ValueError: If no position is known.
@@ -122,16 +104,11 @@ def fit(
     if not paths.known.any():
         raise ValueError("no path is known anywhere: nothing to fit a warp to")
     distances = _distances(field, params, paths)
-    frames, points = len(paths.time), len(paths.known)
 
     def loss(free, key):
         key, direction_key = jax.random.split(key)
-        return sum(distances(*free, *_sample(paths, frames, key), direction_key))
-
-    def mean_distance(free, key):
-        nothing = jnp.zeros((0, 3), paths.position.dtype)
-        all_indices = jnp.arange(frames), jnp.arange(points)
-        return distances(*free, *all_indices, nothing, key)[0]
+        sample = _sample(paths, len(paths.time), key)
+        return sum(distances(*free, *sample, direction_key))
 
     names = {effect.name for effect in field.effects if effect.displace is not None}
     names &= params.keys()  # effects from other packages may have no parameters
@@ -140,10 +117,7 @@ def fit(
         jnp.asarray(_first_places(paths)),
     )
     solution = minimize(loss, free, start.fit_rate, key, start.fit_steps)
-    separate, constants = programs.with_captured(mean_distance, free, key)
-    distance_of = jax.jit(separate)
-    first, last = (float(distance_of(constants, x, key)) for x in (free, solution))
-    return WarpFit(params | solution[0], solution[1], first, last)
+    return params | solution[0]
 
 
 def fit_flow(
@@ -152,7 +126,7 @@ def fit_flow(
     paths: PointPaths,
     key: Key[Array, ""],
     start: TrackStartSpec,
-) -> FlowFit:
+) -> PyTree:
     """Fit the scene flow to the displacements of points between frames.
 
     Displacements between frames that are not one interval apart are scaled. The
@@ -167,7 +141,7 @@ def fit_flow(
       start: Settings.
 
     Returns:
-      The fitted parameters.
+      The parameters of the whole field, with those that were fitted.
 
     Raises:
       ValueError: If no point is known in two consecutive frames.
@@ -185,22 +159,14 @@ def fit_flow(
     unit = max(float(np.linalg.norm(shift, axis=-1)[valid].mean()), 1e-12)
     unit = jax.device_put(np.asarray(unit, shift.dtype))  # captured, not a constant
     errors = _flow_distances(field, paths, shift, valid)
-    frames, points = len(intervals), len(paths.known)
 
     def loss(medium, key):
-        sample = _sample(paths, frames, key)
+        sample = _sample(paths, len(intervals), key)
         return sum(errors(medium, *sample, SOFT_FLOW * unit)) / unit
-
-    def mean_distance(medium):
-        nothing = jnp.zeros((0, 3), paths.position.dtype)
-        return errors(medium, jnp.arange(frames), jnp.arange(points), nothing, 0.0)[0]
 
     medium = params[scene_flow.NAME]
     solution = minimize(loss, medium, start.fit_rate, key, start.fit_steps)
-    separate, constants = programs.with_captured(mean_distance, medium)
-    distance_of = jax.jit(separate)
-    first, last = (float(distance_of(constants, x)) for x in (medium, solution))
-    return FlowFit(params | {scene_flow.NAME: solution}, first, last)
+    return params | {scene_flow.NAME: solution}
 
 
 def _flow_distances(field, paths, shift, valid):

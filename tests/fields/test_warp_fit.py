@@ -91,21 +91,20 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
     field, paths = field_of(name), some_paths()
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
-    assert fitted.first > 0.1
-    assert fitted.last < 0.03
-    places = canonical_places(field, fitted.params)
+    places, canonical = canonical_places(field, fitted), []
     for frame in (3, 12):
         points = np.concatenate([paths.position[:, frame], paths.static])
         back, wall = np.split(places(paths.time[frame], points), [len(paths.position)])
-        # Also where a path was not known.
-        off = np.linalg.norm(back - fitted.canonical, axis=-1)
-        assert np.median(off) < 0.04
+        canonical.append(back)
         # It keeps its size: all of it in one point would be near to its place, too.
         size = np.linalg.norm(back - back.mean(0), axis=-1)
         body = paths.position[:, frame]
         true = np.linalg.norm(body - body.mean(0), axis=-1)
         assert 0.9 < np.median(size / true) < 1.1
         assert np.median(np.linalg.norm(wall - paths.static, axis=-1)) < 0.03
+    # Also where a path was not known.
+    off = np.linalg.norm(np.subtract(*canonical), axis=-1)
+    assert np.median(off) < 0.04
 
 
 @pytest.mark.hard_cases
@@ -166,7 +165,7 @@ def test_a_motion_of_one_s_own_may_have_no_parameters():
     assert rates.keys() == params.keys()
     start = dataclasses.replace(TRACKS, fit_steps=2)
     fitted = warp_fit.fit(field, params, some_paths(), jax.random.key(0), start)
-    assert fitted.params.keys() == params.keys()
+    assert fitted.keys() == params.keys()
 
 
 def test_a_flow_with_a_trunk_of_its_own_learns_slowly_at_first_and_its_medium_not():
@@ -233,8 +232,7 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
     path, time = turning_body()
-    assert fitted.last < 0.3 * fitted.first
-    medium = fitted.params["scene_flow"]
+    medium = fitted["scene_flow"]
 
     def flow(point, time):
         spec, toward = field.spec.scene_flow, jnp.zeros(3)
@@ -260,9 +258,8 @@ def test_points_seen_once_leave_everything_where_it_is():
     field, paths = field_of("nerfies-small"), some_paths(known, static=0)
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
-    assert fitted.last < 5e-3
     places = paths.position[known]
-    moved = canonical_places(field, fitted.params)(0.5, places)
+    moved = canonical_places(field, fitted)(0.5, places)
     assert np.abs(moved - places).max() < 0.03
 
 
