@@ -49,7 +49,7 @@ def choose(
     config: RunConfig,
     capture: Capture,
     user_overrides: tuple[str, ...] = (),
-    try_out: Callable[[RunConfig, tuple[str, ...], Capture], Trial] | None = None,
+    try_out: Callable[[RunConfig, RunConfig, Capture, str], Trial] | None = None,
 ) -> tuple[RunConfig, list[str]]:
     """Enable the effects that a capture needs.
 
@@ -61,8 +61,8 @@ def choose(
       config: Config with a preset.
       capture: The capture, as `stored_capture` returns it.
       user_overrides: Overrides set by the user.
-      try_out: Function that compares the config without and with overrides. None for
-        `compare`.
+      try_out: Function that compares the configs without and with overrides. None for
+        `compare_configs`.
 
     Returns:
       The config with further overrides before those of the user, and lines of text
@@ -76,7 +76,12 @@ def choose(
             continue
         text = f"{finding.effect} ({finding.confidence}: {finding.evidence})"
         if finding.confidence != CERTAIN:
-            trial = (try_out or compare)(config, overrides, capture)
+            changed = dataclasses.replace(
+                config, overrides=(*config.overrides, *overrides)
+            )
+            trial = (try_out or compare_configs)(
+                config, changed, capture, " ".join(overrides)
+            )
             text += (
                 f"; after {trial.steps} steps {trial.without:.2f} dB without and "
                 f"{trial.with_effect:.2f} dB with on {trial.frames} frames left out"
@@ -112,32 +117,14 @@ def _with(config, overrides, user_overrides):
     return dataclasses.replace(config, overrides=(*before, *overrides, *user_overrides))
 
 
-def compare(config: RunConfig, overrides: tuple[str, ...], capture: Capture) -> Trial:
-    """Train a config without and with overrides for a few steps, and score both.
-
-    Every 6th training frame is left out of both, and the two models are scored on these
-    frames, by the protocol of the model with the overrides: if it has a code for each
-    frame, codes are fitted to the left half and the right half is scored.
-
-    Args:
-      config: Config with a preset.
-      overrides: Overrides that enable an effect.
-      capture: The capture, as `stored_capture` returns it.
-
-    Returns:
-      The scores.
-
-    Raises:
-      KeyboardInterrupt: If the process was asked to stop.
-    """
-    new_config = dataclasses.replace(config, overrides=(*config.overrides, *overrides))
-    return compare_configs(config, new_config, capture, " ".join(overrides))
-
-
 def compare_configs(
     config: RunConfig, changed: RunConfig, capture: Capture, name: str
 ) -> Trial:
-    """Train two configs for a few steps, and score both like `compare`.
+    """Train two configs for a few steps, and score both.
+
+    Every 6th training frame is left out of both, and the two models are scored on these
+    frames, by the protocol of the changed model: if it has a code for each frame, codes
+    are fitted to the left half and the right half is scored.
 
     Args:
       config: Config with a preset.

@@ -29,8 +29,8 @@ def chosen(monkeypatch):
         )
         tried = []
 
-        def try_out(config, overrides, capture):
-            tried.append(overrides)
+        def try_out(config, changed, capture, name):
+            tried.append(changed.overrides[len(config.overrides) :])
             return Trial(300, 8, 20.0, 20.0 + gain)
 
         capture = scenes.tiny_capture()
@@ -83,7 +83,8 @@ def test_a_trial_finds_that_exposures_pay_where_brightness_alternates():
     capture = dataclasses.replace(capture, images=images)
     config = RunConfig("splats-static-small", steps=60)
     before = runs.new_run(config, capture).capture.images.copy()
-    trial = effect_choice.compare(config, (EXPOSURE,), capture)
+    changed = dataclasses.replace(config, overrides=(EXPOSURE,))
+    trial = effect_choice.compare_configs(config, changed, capture, "exposures")
     assert trial.steps == 60
     assert trial.pays
     np.testing.assert_array_equal(capture.images, before)
