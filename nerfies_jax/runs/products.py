@@ -83,7 +83,7 @@ def make(
     state, renderer = trained.result.state, trained.renderer
     run = with_found_cameras(run, state)
     rows, skipped_frames = _frames_to_score(run, trained)
-    scores = evaluation.score(trained.draw, state, run.observed, rows)
+    scores = evaluation.score(renderer, state, run.observed, rows)
     if not np.isfinite(scores.color).all():
         raise FloatingPointError(
             f"no report: the images rendered at step {trained.result.steps:,} are not "
@@ -141,7 +141,7 @@ def make(
             with events.stage("saving the model"):
                 exports = attempt(Saved(), save, target, *model)
             numbers, quality_notes = quality.measure(
-                run, state, trained.draw, scores, extra, seconds
+                run, state, renderer, scores, extra, seconds
             )
             metrics = heldout.metrics(numbers)
             metrics += measured(run, trained, scores, ms_per_frame, start_time)

@@ -11,7 +11,6 @@ import numpy as np
 from nerfies_jax import evaluation
 from nerfies_jax.evaluation import Renderer
 from nerfies_jax.evaluation.representation import HalfScorer
-from nerfies_jax.evaluation.scores import Draw
 from nerfies_jax.runs import budget, curves, run_folder, validation
 from nerfies_jax.runs.run import Run
 from nerfies_jax.runtime import console, data_parallel, events
@@ -55,7 +54,6 @@ class Trained(NamedTuple):
 
     result: FitResult
     renderer: Renderer
-    draw: Draw  # renderer of the captured frames
     watched: np.ndarray  # rows of the held-out frames evaluated during training
     scorer: HalfScorer | None = None  # of halves of frames with fitted codes
 
@@ -111,7 +109,10 @@ def train(
             "training frames do not fit in the memory of the device, so those of the "
             "next steps are streamed to it"
         )
-    history = History() if record is None else _history(record)
+    # Earlier versions stored no processor time.
+    history = History()
+    if record is not None:
+        history = History(**{"cpu_seconds": math.nan, **record})
     first = evaluation.view_of(run.capture, int(rows[0])) if len(rows) else None
     scorer = half_scorer(run)
     seconds = history.compile_seconds + _compile(run, state, frames, renderer, first)
@@ -164,12 +165,7 @@ def train(
     # The products then share programs with the renderer and with later commands.
     result = result._replace(state=data_parallel.uncommitted(result.state))
     result = _with_best(run, result, checkpoints)
-    return Trained(result, renderer, renderer, rows, scorer)
-
-
-def _history(record):
-    """Restore the history of a run, which earlier versions stored without a field."""
-    return History(**{"cpu_seconds": math.nan, **record})
+    return Trained(result, renderer, rows, scorer)
 
 
 def _evaluations(pace, frame_seconds, heldout):

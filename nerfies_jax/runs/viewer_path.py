@@ -330,7 +330,8 @@ class PathPanel:
         next(self.rendering)
         self._progress.value, self._progress.visible = 0.0, True
         self._render.label = "cancel rendering"
-        self._message.content = f"Rendering {total} images of {_text(path.size)}."
+        width, height = path.size
+        self._message.content = f"Rendering {total} images of {width}x{height}."
 
     def _advance_rendering(self, state):
         try:
@@ -371,7 +372,3 @@ def _next_name(folder: pathlib.Path, stem: str, suffix: str) -> pathlib.Path:
     while (path := folder / f"{stem}{number}{suffix}").exists():
         number += 1
     return path
-
-
-def _text(size):
-    return "x".join(map(str, size))

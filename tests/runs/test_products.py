@@ -99,7 +99,7 @@ def test_a_player_that_fails_loses_nothing_but_itself(tmp_path):
     run = Run(config, capture, capture, kind, None, None, None)
     black = Rendering(np.zeros((30, 40, 3), np.float32), None, None)
     result = types.SimpleNamespace(state=None)
-    trained = Trained(result, lambda *_: black, None, None)
+    trained = Trained(result, lambda *_: black, None)
     assert products.save_player(tmp_path, run, trained) == (
         [],
         ["The interactive player could not be created: KeyError: 'mean'"],
@@ -144,7 +144,7 @@ def test_the_curve_and_the_headline_agree_visibly(tmp_path, monkeypatch):
     result = types.SimpleNamespace(history=history, seconds=3.5)
     score = curve_figure.Result(29.5, 3, is_fitted=False)
     for watched, final in ((np.arange(2), (3.5, 29.5, 3, 2)), (np.arange(3), None)):
-        trained = Trained(result, None, None, watched)
+        trained = Trained(result, None, watched)
         path = tmp_path / "curve.png"
         assert curve_figure.save(path, run, trained, score) == path
         (history, _, mark) = curves.pop()
