@@ -27,14 +27,15 @@ for options in (None, UNDIVIDED):
 @pytest.mark.full
 @pytest.mark.skipif(platform.cores() < 2, reason="there is one core to divide among")
 def test_devices_that_see_a_core_each_and_what_asks_for_it_do_not_divide_loops():
-    assert are_divided("all") == ["True", "False"]
-    assert are_divided("one") == ["False", "False"]
+    assert printed_by(DIVIDED, "all") == ["True", "False"]
+    assert printed_by(DIVIDED, "one") == ["False", "False"]
 
 
-def are_divided(threads):
+def printed_by(code, *arguments):
+    """The words that a process prints which finds no settings of its cores."""
     own = ("XLA_FLAGS", "PJRT_NPROC", "NPROC", "JAX_NUM_CPU_DEVICES")
     environment = {name: x for name, x in os.environ.items() if name not in own}
-    command = [sys.executable, "-c", DIVIDED, threads]
+    command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=True
     )
@@ -59,12 +60,7 @@ print(np.abs(rotated - vectors / angle * near)[angle[:, 0] < 3].max() < 1e-5)
 @pytest.mark.full
 def test_rotations_are_right_in_wide_vectors():
     """XLA's arctan is wrong there for long arrays."""
-    environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
-    command = [sys.executable, "-c", WIDE]
-    done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["True"]
+    assert printed_by(WIDE) == ["True"]
 
 
 @pytest.mark.parametrize("wide", [False, True])

@@ -68,6 +68,13 @@ def moving(monkeypatch):
 
 
 @pytest.fixture
+def clip(tmp_path):
+    frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
+    video.write_video(tmp_path / "clip.mp4", frames, 30)
+    return tmp_path / "clip.mp4"
+
+
+@pytest.fixture
 def photographs(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
@@ -246,12 +253,10 @@ def test_other_masks_make_another_capture_and_what_is_no_image_does_not(
 
 
 def test_a_run_of_a_video_prepares_it_once_beside_the_run(
-    tmp_path, mapper, monkeypatch
+    clip, tmp_path, mapper, monkeypatch
 ):
     monkeypatch.setattr(movers, "masks_of", lambda capture: None)
-    frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
-    video.write_video(tmp_path / "clip.mp4", frames, 30)
-    config = RunConfig(source=CaptureSource(tmp_path / "clip.mp4", heldout="4"))
+    config = RunConfig(source=CaptureSource(clip, heldout="4"))
     how = Preparation(frames=9, max_side=24)
     for _ in range(2):
         moving = reconstruction._with_cameras(config, tmp_path / "run", how)
@@ -266,11 +271,11 @@ def test_a_run_of_a_video_prepares_it_once_beside_the_run(
     # As many threads as there are cores change nothing; another video does.
     threads = dataclasses.replace(how, threads=3)
     reconstruction._with_cameras(config, tmp_path / "run", threads)
-    clip = (tmp_path / "clip.mp4").read_bytes()
-    (tmp_path / "clip.mp4").write_bytes(clip[:-1] + bytes([clip[-1] ^ 1]))
+    content = clip.read_bytes()
+    clip.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     with pytest.raises(ValueError, match=r"run-capture: .*content differ"):
         reconstruction._with_cameras(config, tmp_path / "run", how)
-    (tmp_path / "clip.mp4").write_bytes(clip)
+    clip.write_bytes(content)
     other = dataclasses.replace(how, passes=1)
     with pytest.raises(ValueError, match=r"run-capture: .*how differ.*out="):
         reconstruction._with_cameras(config, tmp_path / "run", other)
@@ -303,10 +308,8 @@ def test_wrong_settings_are_refused_before_a_video_is_read(wrong, words):
         Preparation(**wrong)
 
 
-def test_wrong_words_are_refused_before_cameras_are_looked_for(tmp_path, mapper):
-    frames = [models.image(row).repeat(2, 0).repeat(2, 1) for row in range(9)]
-    video.write_video(tmp_path / "clip.mp4", frames, 30)
-    source = CaptureSource(tmp_path / "clip.mp4")
+def test_wrong_words_are_refused_before_cameras_are_looked_for(clip, tmp_path, mapper):
+    source = CaptureSource(clip)
     wrong = [RunConfig("nerf-smal", source), RunConfig("nerf", source, steps=0)]
     # None: one that tracks choose. No such preset has these.
     wrong += [

@@ -30,22 +30,11 @@ def test_every_preset_finds_its_representation(name):
         assert kind.with_steps(spec, 77).steps == 77
 
 
-def test_preset_names_are_unique_over_all_representations():
-    names = [p for each in representations.installed().values() for p in each.presets]
-    assert len(names) == len(set(names))
-
-
 def test_an_unknown_preset_names_those_of_every_representation():
     with pytest.raises(ValueError, match="no preset 'magic'") as error:
         representations.of_preset("magic")
     for each in representations.installed().values():
         assert all(preset in str(error.value) for preset in each.presets)
-
-
-def test_a_preset_takes_steps_and_settings():
-    config = RunConfig("splats-static-small", steps=50, overrides=("sh_degree=0",))
-    spec = runs.scene_spec(config)
-    assert (spec.steps, spec.sh_degree) == (50, 0)
 
 
 @dataclasses.dataclass(frozen=True)

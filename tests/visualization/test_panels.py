@@ -17,19 +17,6 @@ def mapped(name, value):
     return np.round(255 * np.array(matplotlib.colormaps[name](int(value))[:3]))
 
 
-def test_depth_is_bright_near_and_dark_far_over_one_range():
-    depth = np.array([[[1.0, 2.0]], [[3.0, 5.0]]])
-    colored = panels.color_depth(depth, limits=(1.0, 5.0))
-    assert (colored.low, colored.high) == (1.0, 5.0)
-    for at, index in (
-        ((0, 0, 0), 255),
-        ((0, 0, 1), 191),
-        ((1, 0, 0), 128),
-        ((1, 0, 1), 0),
-    ):
-        np.testing.assert_array_equal(colored.image[at], mapped("viridis", index))
-
-
 @pytest.mark.hard_cases
 def test_one_stray_depth_does_not_flatten_the_image(rng):
     depth = rng.uniform(2, 4, (3, 40, 40))
