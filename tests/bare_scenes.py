@@ -17,7 +17,6 @@ from gaussians_jax.init.points import InitSpec, StartSpec
 from gaussians_jax.motion.anchors import AnchorMotionSpec
 from gaussians_jax.motion.embedding import EmbeddingMotionSpec
 from gaussians_jax.motion.kan import KanMotionSpec
-from gaussians_jax.motion.mlp import MotionSpec
 from gaussians_jax.motion.nodes import NodeMotionSpec
 from gaussians_jax.motion.planes import PlaneMotionSpec
 from gaussians_jax.motion.se3_bases import SE3BasesSpec
@@ -51,6 +50,23 @@ LEANS_ON = {
     "neighbors": ("motion",),
     "motion_growth": ("motion", "strategy"),
     "flow": ("motion",),
+}
+# Settings of motions on tiny scenes. Each takes those that it has.
+SMALL_NETWORK = {
+    **{"position": FEW, "base_time": FEW, "time": FEW},
+    **{"base_depth": 1, "base_width": 8, "basis_width": 8},
+    **{"depth": 1, "width": 8, "skips": ()},
+}
+SMALL_MOTIONS = {
+    KanMotionSpec: {"embedding": 4, "time_code": 3, "hidden": (6,), "kernels": 3},
+    EmbeddingMotionSpec: {"embedding": 4, "time_code": 3, "width": 6},
+    SE3BasesSpec: {"bases": 2, "knots": 3},
+    NodeMotionSpec: {"nodes": 6, "links": 2, **SMALL_NETWORK},
+    AnchorMotionSpec: {
+        **{"count": 2, "reference": 3, "residual": 2, "time_code": 3},
+        **{"width": 6, "make_width": 6},
+    },
+    TimeBasisSpec: {"count": 2, **SMALL_NETWORK},
 }
 
 
@@ -136,40 +152,13 @@ def tiny_splats(name):
     """A preset of `gaussians_jax` with a few hundred Gaussians and small networks."""
     spec = splat_presets.with_steps(splat_presets.PRESETS[name], STEPS)
     motion = spec.motion
-    if isinstance(motion, KanMotionSpec):
-        motion = shrunk(motion, embedding=4, time_code=3, hidden=(6,), kernels=3)
-    elif isinstance(motion, EmbeddingMotionSpec):
-        motion = shrunk(motion, embedding=4, time_code=3, width=6)
-    elif isinstance(motion, MotionSpec):
-        motion = shrunk(motion, position=FEW, time=FEW, depth=1, width=8, skips=())
-    elif isinstance(motion, SE3BasesSpec):
-        motion = shrunk(motion, bases=2, knots=3)
-    elif isinstance(motion, NodeMotionSpec):
-        few = {"position": FEW, "time": FEW, "depth": 1, "width": 8, "skips": ()}
-        motion = shrunk(motion, nodes=6, links=2, **few)
-    elif isinstance(motion, AnchorMotionSpec):
-        few = {"count": 2, "reference": 3, "residual": 2, "time_code": 3}
-        motion = shrunk(motion, width=6, make_width=6, **few)
-    elif isinstance(motion, PlaneMotionSpec):
+    if isinstance(motion, PlaneMotionSpec):
         few = shrunk(
             motion.planes, vertices=4, multiples=(1, 2), timestamps=3, features=2
         )
         motion = shrunk(motion, planes=few, width=8)
-    elif isinstance(motion, TimeBasisSpec):
-        motion = shrunk(motion, count=2, time=FEW, depth=1, width=8)
     else:
-        motion = shrunk(
-            motion,
-            position=FEW,
-            base_time=FEW,
-            time=FEW,
-            base_depth=1,
-            base_width=8,
-            basis_width=8,
-            depth=1,
-            width=8,
-            skips=(),
-        )
+        motion = shrunk(motion, **SMALL_MOTIONS.get(type(motion), SMALL_NETWORK))
     return dataclasses.replace(
         spec,
         batch_size=1,

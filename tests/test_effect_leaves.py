@@ -19,6 +19,7 @@ from gaussians_jax.motion import mlp as mlp_motion
 from gaussians_jax.motion import nodes as node_motion
 from gaussians_jax.motion import planes as plane_motion
 from gaussians_jax.motion.anchors import AnchorMotionSpec
+from gaussians_jax.motion.basis import BasisMotionSpec
 from gaussians_jax.motion.embedding import EmbeddingMotionSpec
 from gaussians_jax.motion.kan import KanMotionSpec
 from gaussians_jax.motion.mlp import MotionSpec
@@ -61,6 +62,22 @@ METADATA = SceneMetadata(
     times=tuple(t / (TIMESTAMPS - 1) for t in range(TIMESTAMPS)),
     exposures=tuple((row, row, 0.0) for row in range(EXPOSURES)),
 )
+# Of each motion its name, whether Gaussians have parameters of it, and the function
+# that makes its networks.
+MOTIONS = {
+    MotionSpec: ("mlp_motion", False, mlp_motion.init),
+    KanMotionSpec: ("kan_motion", True, kan_motion.init),
+    BasisMotionSpec: ("motion_basis", False, motion_basis.init),
+    EmbeddingMotionSpec: ("embedding_motion", True, embedding_motion.init),
+    SE3BasesSpec: ("se3_bases", True, se3_bases.init),
+    TimeBasisSpec: ("time_basis", True, time_basis.init),
+    NodeMotionSpec: ("node_motion", False, node_motion.init),
+    AnchorMotionSpec: ("anchor_motion", True, anchors.init),
+    PlaneMotionSpec: ("plane_motion", False, plane_motion.init),
+    PolynomialMotionSpec: ("polynomial_motion", True, None),
+    SplineMotionSpec: ("spline_motion", True, None),
+}
+BY_FRAMES = (kan_motion.init, embedding_motion.init, anchors.init)
 
 
 def shapes(tree):
@@ -168,35 +185,15 @@ def test_splats_have_the_arrays_of_what_they_have_and_no_others(preset):
         state = splat_scene.build(spec, metadata).init(capture, jax.random.key(0))
         motion, key, nets = spec.motion, jax.random.key(0), {}
         rows, states = {"splats"}, set()
-        if isinstance(motion, MotionSpec):
-            nets["mlp_motion"] = mlp_motion.init(key, motion)
-        elif isinstance(motion, KanMotionSpec):
-            rows.add("kan_motion")
-            nets["kan_motion"] = kan_motion.init(key, motion, metadata.frames)
-        elif isinstance(motion, EmbeddingMotionSpec):
-            rows.add("embedding_motion")
-            own = embedding_motion.init(key, motion, metadata.frames)
-            nets["embedding_motion"] = own
-        elif isinstance(motion, SE3BasesSpec):
-            rows.add("se3_bases")
-            nets["se3_bases"] = se3_bases.init(key, motion)
-        elif isinstance(motion, TimeBasisSpec):
-            rows.add("time_basis")
-            nets["time_basis"] = time_basis.init(key, motion)
-        elif isinstance(motion, NodeMotionSpec):
-            nets["node_motion"] = node_motion.init(key, motion)
-            states.add("node_motion")
-        elif isinstance(motion, AnchorMotionSpec):
-            rows.add("anchor_motion")
-            nets["anchor_motion"] = anchors.init(key, motion, metadata.frames)
-        elif isinstance(motion, PlaneMotionSpec):
-            nets["plane_motion"] = plane_motion.init(key, motion)
-        elif isinstance(motion, PolynomialMotionSpec):
-            rows.add("polynomial_motion")
-        elif isinstance(motion, SplineMotionSpec):
-            rows.add("spline_motion")
-        elif motion is not None:
-            nets["motion_basis"] = motion_basis.init(key, motion)
+        if motion is not None:
+            name, has_rows, init = MOTIONS[type(motion)]
+            if has_rows:
+                rows.add(name)
+            if init is not None:
+                frames = (metadata.frames,) if init in BY_FRAMES else ()
+                nets[name] = init(key, motion, *frames)
+            if name == "node_motion":
+                states.add(name)
         if spec.temporal_opacity is not None:
             rows.add("temporal_opacity")
         if spec.carried is not None:
