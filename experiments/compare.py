@@ -315,6 +315,7 @@ def save(folder: pathlib.Path, run_list, goals) -> None:
 def draw(path: pathlib.Path, run_list, count: int, trusted_names=()) -> None:
     """Draw held-out frames: the truth, the renders of every run and their errors."""
     from nerfies_jax import evaluation, runs
+    from nerfies_jax.capture.images import write_png
     from nerfies_jax.visualization import panels
 
     scores = []
@@ -343,7 +344,7 @@ def draw(path: pathlib.Path, run_list, count: int, trusted_names=()) -> None:
         ]
         captions += ["", *(f"error, to {LARGEST_ERROR:g}" for _ in scores)]
     sheet = panels.contact_sheet(tiles, captions, columns=1 + len(run_list))
-    panels.save(sheet, path)
+    write_png(path, sheet)
 
 
 if __name__ == "__main__":

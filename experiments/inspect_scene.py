@@ -48,11 +48,11 @@ def main(args):
         from nerfies_jax import runs
         from nerfies_jax.capture import gate
         from nerfies_jax.capture.capture import describe
+        from nerfies_jax.capture.images import write_png
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.preprocessing import inspection
         from nerfies_jax.runs import adviser
         from nerfies_jax.runs.platform import CACHE
-        from nerfies_jax.visualization import panels
 
         source = cli.plain(args.source)
         capture = runs.stored_capture(source, args.seed)
@@ -64,7 +64,7 @@ def main(args):
             console.say(line)
         path = args.image or _free(pathlib.Path("runs"), f"inspect-{_name(capture)}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        panels.save(inspection_result.sheet, path)
+        write_png(path, inspection_result.sheet)
         console.say(f"contact sheet: {path}")
         record = _as_json(capture, inspection_result, advice)
         if args.findings is not None:

@@ -43,10 +43,10 @@ def main(args):
         platform.start_jax("cpu")
         from nerfies_jax import runs
         from nerfies_jax.capture.capture import describe
+        from nerfies_jax.capture.images import write_png
         from nerfies_jax.capture.json_files import write_json
         from nerfies_jax.preprocessing import contact_sheet, record, summary, view_set
         from nerfies_jax.runs import run_folder
-        from nerfies_jax.visualization import panels
 
         capture = runs.stored_capture(cli.plain(args.source), args.seed)
         stem = f"preprocessed-{'-'.join(capture.name.replace('/', ' ').split())}"
@@ -65,7 +65,7 @@ def main(args):
         if errors is not None:
             document["errors"] = _as_json(errors._asdict())
             console.say("\n".join(_error_lines(errors)))
-        panels.save(contact_sheet.followed(views, evidence), out / "tracks.png")
+        write_png(out / "tracks.png", contact_sheet.followed(views, evidence))
         write_json(out / "preprocessing.json", document)
     console.say(f"frames with tracks: {out / 'tracks.png'}")
     console.say(f"stored result: {path if path.exists() else 'none'}")

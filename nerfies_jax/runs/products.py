@@ -16,6 +16,7 @@ from nerfies_jax import evaluation
 from nerfies_jax.capture import camera_paths, exr
 from nerfies_jax.capture.capture import Capture, CaptureError
 from nerfies_jax.capture.extras import MissingExtra
+from nerfies_jax.capture.images import write_png
 from nerfies_jax.capture.json_files import merged_folder, write_json
 from nerfies_jax.capture.video import write_video
 from nerfies_jax.evaluation import Halves, Renderer, Scored, heldout
@@ -384,7 +385,7 @@ def _save_comparison(
         captions,
         known_depth=scores.alpha[places] > 0.5,
     )
-    panels.save(image, path)
+    write_png(path, image)
     return path
 
 
@@ -464,7 +465,7 @@ def save_player(
             poster,
         )
         image = folder / "player.png"
-        panels.save(poster, image)
+        write_png(image, poster)
     except (OSError, CaptureError):  # `Attempts` reports files that are not written
         raise
     except Exception as error:  # no failure of the player may affect other products

@@ -15,7 +15,6 @@ import PIL.ImageDraw
 import PIL.ImageFont
 import skimage.color
 
-from nerfies_jax.capture import images
 from nerfies_jax.capture.json_files import replaced_file
 from nerfies_jax.visualization import figures
 
@@ -305,16 +304,6 @@ def _mark_final(axes, final):
         va="top",
         color=color,
     )
-
-
-def save(image: np.ndarray, path: str | pathlib.Path) -> None:
-    """Write an image as PNG, atomically.
-
-    Args:
-      image: uint8 image.
-      path: The file.
-    """
-    images.write_png(path, image)
 
 
 def as_bytes(image: np.ndarray) -> np.ndarray:

@@ -12,12 +12,12 @@ import PIL.Image
 import pytest
 
 from nerfies_jax.capture.capture import CaptureError
+from nerfies_jax.capture.images import write_png
 from nerfies_jax.evaluation import heldout
 from nerfies_jax.metrics.clock import Metric
 from nerfies_jax.metrics.metric_table import GROUPS, METRICS, metric
 from nerfies_jax.runs import commands, relative_paths, report
 from nerfies_jax.runs.config import CaptureSource, RunConfig
-from nerfies_jax.visualization import panels
 
 MEASURED = (
     Metric("heldout.psnr", 30.937, "dB", "higher", 0.2),
@@ -56,7 +56,7 @@ class Page(html.parser.HTMLParser):
 @pytest.fixture
 def image(tmp_path, rng):
     path = tmp_path / "heldout.png"
-    panels.save(rng.integers(0, 256, (8, 9, 3), dtype=np.uint8), path)
+    write_png(path, rng.integers(0, 256, (8, 9, 3), dtype=np.uint8))
     return path
 
 

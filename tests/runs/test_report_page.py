@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from nerfies_jax.capture.images import write_png
 from nerfies_jax.metrics.metric_table import METRICS, metric
 from nerfies_jax.runs import report
-from nerfies_jax.visualization import panels
 from tests.gaussians import browser as shared
 
 pytestmark = pytest.mark.slow
@@ -25,7 +25,7 @@ def address(tmp_path_factory):
     (folder / "scene.mp4").write_bytes(b"not really a video")
     broad = np.zeros((90, report.WIDE_PX + 1, 3), np.uint8)
     for name, image in (("broad", broad), ("small", broad[:, :100])):
-        panels.save(image, folder / f"{name}.png")
+        write_png(folder / f"{name}.png", image)
     path = report.write(
         folder,
         "a run with a name that is longer than a phone is wide",

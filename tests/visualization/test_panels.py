@@ -143,9 +143,3 @@ def test_colors_are_matplotlibs_and_only_the_curve_needs_it(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(extras.MissingExtra, match=r"matplotlib.*nerfies-jax\[report\]"):
         panels.curve({"one": panels.History([0], [20])}, tmp_path / "psnr.png")
-
-
-def test_saving_keeps_the_pixels(tmp_path, rng):
-    image = rng.integers(0, 256, (7, 9, 3), dtype=np.uint8)
-    panels.save(image, tmp_path / "p.png")
-    np.testing.assert_array_equal(skimage.io.imread(tmp_path / "p.png"), image)
