@@ -58,15 +58,6 @@ class Path:
         unit_axis(self.axis)
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Return the pose at a time.
-
-        Args:
-          place: Position of the body without motion, in scene units.
-          time: Time in [0, 1].
-
-        Returns:
-          The pose.
-        """
         cycles, phase, sway, origin = (
             jnp.asarray(value, time.dtype)
             for value in (self.cycles, self.phase, self.sway, place)
@@ -106,15 +97,6 @@ class Arm:
             raise ValueError("an arm needs at least one hinge; use Path() for none")
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Return the pose at a time.
-
-        Args:
-          place: Position of the body without motion, in scene units.
-          time: Time in [0, 1].
-
-        Returns:
-          The pose.
-        """
         rotation = jnp.eye(3, dtype=time.dtype)
         position = jnp.asarray(place, time.dtype)
         for hinge in reversed(self.hinges):
@@ -142,15 +124,6 @@ class Glide:
             )
 
     def pose(self, place: Vector, time: Float[Array, ""]) -> Pose:
-        """Return the pose at a time.
-
-        Args:
-          place: Position of the body at the start, in scene units.
-          time: Time in [0, 1].
-
-        Returns:
-          The pose.
-        """
         share = jnp.clip((time - self.start) / (self.stop - self.start), 0, 1)
         travel, origin = (jnp.asarray(x, time.dtype) for x in (self.travel, place))
         return Pose(jnp.eye(3, dtype=time.dtype), origin + share * travel)

@@ -38,52 +38,23 @@ class Squash:
     phase: float = 0.0  # in cycles
 
 
-@dataclasses.dataclass(frozen=True)
-class Sphere:
-    """A sphere around the body's origin, or an ellipsoid if it is squashed."""
-
-    radius: float
-    squash: Squash | None = None
-
-    def __post_init__(self):
-        _positive(radius=self.radius)
+class _Shape:
+    """Maps and intersections of a shape. By default its material does not move."""
 
     def bends(self) -> bool:
-        """Return whether the material moves within the body.
-
-        Returns:
-          True for a sphere with `squash`.
-        """
-        return self.squash is not None
+        """Return whether the material moves within the body."""
+        return False
 
     def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a material point to the body.
-
-        Args:
-          material: Material point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          Body point, [3].
-        """
-        scale, base = self._stretch(time)
-        return base + scale * (material - base)
+        """Map a material point [3] to the body at a time in [0, 1]."""
+        return material
 
     def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a body point to the material.
-
-        Args:
-          point: Body point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          Material point, [3].
-        """
-        scale, base = self._stretch(time)
-        return base + (point - base) / scale
+        """Map a body point [3] to the material at a time in [0, 1]."""
+        return point
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray in material coordinates, in which the shape is a sphere.
+        """Find the first intersection of a ray.
 
         Args:
           origin: Origin of the ray in body coordinates, [3].
@@ -93,6 +64,32 @@ class Sphere:
         Returns:
           The first intersection.
         """
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Sphere(_Shape):
+    """A sphere around the body's origin, or an ellipsoid if it is squashed."""
+
+    radius: float
+    squash: Squash | None = None
+
+    def __post_init__(self):
+        _positive(radius=self.radius)
+
+    def bends(self) -> bool:
+        return self.squash is not None
+
+    def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
+        scale, base = self._stretch(time)
+        return base + scale * (material - base)
+
+    def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
+        scale, base = self._stretch(time)
+        return base + (point - base) / scale
+
+    def cross(self, origin, direction, time) -> Crossing:
+        """Intersect a ray in material coordinates, in which the shape is a sphere."""
         scale, _ = self._stretch(time)
         start, along = self.undeform(origin, time), direction / scale
         speed_sq = jnp.sum(along**2)
@@ -121,7 +118,7 @@ class Sphere:
 
 
 @dataclasses.dataclass(frozen=True)
-class Box:
+class Box(_Shape):
     """A box around the body's origin with half sizes `half`."""
 
     half: Vector
@@ -129,49 +126,8 @@ class Box:
     def __post_init__(self):
         _positive(half=min(self.half))
 
-    def bends(self) -> bool:
-        """Return whether the material moves within the body.
-
-        Returns:
-          False.
-        """
-        return False
-
-    def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a material point to the body.
-
-        Args:
-          material: Material point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          The same point, [3].
-        """
-        return material
-
-    def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a body point to the material.
-
-        Args:
-          point: Body point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          The same point, [3].
-        """
-        return point
-
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray. Rays that start inside have no intersection.
-
-        Args:
-          origin: Origin of the ray in body coordinates, [3].
-          direction: Direction of any length, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          The first intersection.
-        """
+        """Intersect a ray. Rays that start inside have no intersection."""
         half = jnp.asarray(self.half, time.dtype)
         distance, leave = rays.intersect_aabb(origin, direction, -half, half)
         hit = (distance > 0) & (distance < leave)
@@ -184,7 +140,7 @@ class Box:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sheet:
+class Sheet(_Shape):
     """A cloth in the body's xy plane that hangs from its upper edge and billows.
 
     The material point (u, v, w) maps to (u + sway(v), v, w + billow(u, v)). This is a
@@ -211,52 +167,20 @@ class Sheet:
             raise ValueError(f"sway={self.sway} must not be negative; 0 disables it")
 
     def bends(self) -> bool:
-        """Return whether the material moves within the body.
-
-        Returns:
-          True.
-        """
         return True
 
     def deform(self, material: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a material point to the body.
-
-        Args:
-          material: Material point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          Body point, [3].
-        """
         u, v, w = material
         sway, billow = self._sway(v, time), self._billow(u, v, time)
         return jnp.stack([u + sway, v, w + billow])
 
     def undeform(self, point: Float[Array, "3"], time: Float[Array, ""]):
-        """Map a body point to the material.
-
-        Args:
-          point: Body point, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          Material point, [3].
-        """
         x, y, z = point
         u = x - self._sway(y, time)
         return jnp.stack([u, y, z - self._billow(u, y, time)])
 
     def cross(self, origin, direction, time) -> Crossing:
-        """Intersect a ray by sampling, with Newton's method in the bracket.
-
-        Args:
-          origin: Origin of the ray in body coordinates, [3].
-          direction: Direction of any length, [3].
-          time: Time in [0, 1].
-
-        Returns:
-          The first intersection.
-        """
+        """Intersect a ray by sampling, with Newton's method in the bracket."""
         distance, hit = self._root(origin, direction, time)
         material = self.undeform(origin + distance * direction, time)
         normal = jax.grad(lambda point: self.undeform(point, time)[2])(
