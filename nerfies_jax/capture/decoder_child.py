@@ -7,6 +7,7 @@ its end.
 
 import contextlib
 import functools
+import importlib
 import json
 import os
 import pathlib
@@ -38,27 +39,15 @@ def _limit(cpu_seconds, memory_bytes):
         resource.setrlimit(resource.RLIMIT_AS, (size_bytes + int(memory_bytes), hard))
 
 
-def _colmap(folder):
-    from nerfies_jax.capture import colmap_tables
-
-    yield colmap_tables.read(folder)
+def _table(module, **arguments):
+    yield module.read(**arguments)
 
 
-def _exr(path, header_only):
-    from nerfies_jax.capture import exr_decoding
-
-    yield exr_decoding.read(path, header_only)
-
-
-def _image(path):
-    from nerfies_jax.capture import images
-
+def _image(images, path):
     yield {}, {"pixels": images.decode(path)}
 
 
-def _mask(path):
-    from nerfies_jax.capture import masks
-
+def _mask(masks, path):
     pixels = masks.decode(path)
     arrays = {"value": pixels.value}
     if pixels.alpha is not None:
@@ -66,9 +55,7 @@ def _mask(path):
     yield {"full": pixels.full, "colorful": pixels.colorful}, arrays
 
 
-def _photograph(path, header_only):
-    from nerfies_jax.capture import photographs
-
+def _photograph(photographs, path, header_only):
     photographs.heic_is_read()
     file = pathlib.Path(path)
     try:
@@ -81,36 +68,19 @@ def _photograph(path, header_only):
         yield {"refused": type(error).__name__, "message": str(error)}, {}
 
 
-_VIDEO = "nerfies_jax.capture.video_decoding"
-
-
-def _video(operation, **arguments):
-    from nerfies_jax.capture import video_decoding
-
-    yield from getattr(video_decoding, operation)(**arguments)
-
-
-_NETWORK = "nerfies_jax.capture.network_decoding"
-
-
-def _network(operation, **arguments):
-    from nerfies_jax.capture import network_decoding
-
-    yield from getattr(network_decoding, operation)(**arguments)
-
-
-OPERATIONS: dict[str, tuple[Callable[..., Iterable], str]] = {
-    "colmap": (_colmap, "nerfies_jax.capture.colmap_tables"),
-    "exr": (_exr, "nerfies_jax.capture.exr_decoding"),
-    "video": (functools.partial(_video, "frames"), _VIDEO),
-    "video_length": (functools.partial(_video, "length"), _VIDEO),
-    "video_notes": (functools.partial(_video, "notes"), _VIDEO),
-    "video_transfer": (functools.partial(_video, "transfer"), _VIDEO),
-    "network": (functools.partial(_network, "run"), _NETWORK),
-    "network_header": (functools.partial(_network, "header"), _NETWORK),
-    "image": (_image, "nerfies_jax.capture.images"),
-    "mask": (_mask, "nerfies_jax.capture.masks"),
-    "photograph": (_photograph, "nerfies_jax.capture.photographs"),
+# The module that decodes, and a function of it and the arguments, or its own function.
+OPERATIONS: dict[str, tuple[str, Callable[..., Iterable] | str]] = {
+    "colmap": ("colmap_tables", _table),
+    "exr": ("exr_decoding", _table),
+    "video": ("video_decoding", "frames"),
+    "video_length": ("video_decoding", "length"),
+    "video_notes": ("video_decoding", "notes"),
+    "video_transfer": ("video_decoding", "transfer"),
+    "network": ("network_decoding", "run"),
+    "network_header": ("network_decoding", "header"),
+    "image": ("images", _image),
+    "mask": ("masks", _mask),
+    "photograph": ("photographs", _photograph),
 }
 
 
@@ -132,21 +102,23 @@ def _say(stream, about):
 
 def main() -> None:
     """Answer requests until stdin ends."""
-    import importlib
-
     children.end_with_parent()
     # Libraries that print must not write into the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     for line in sys.stdin.buffer:
         job = json.loads(line)
-        operation, module = OPERATIONS[job["operation"]]
+        name, operation = OPERATIONS[job["operation"]]
         # Imported first, since the limit of memory excludes libraries.
-        importlib.import_module(module)
+        module = importlib.import_module(f"nerfies_jax.capture.{name}")
+        if isinstance(operation, str):
+            decode = getattr(module, operation)
+        else:
+            decode = functools.partial(operation, module)
         try:
             start_time = time.process_time()
             _limit(job["cpu_seconds"], job["memory_bytes"])
-            for about, arrays in operation(**job["arguments"]):
+            for about, arrays in decode(**job["arguments"]):
                 _answer(answers, about, arrays)
                 if time.process_time() - start_time > 1.0:  # the limit holds per answer
                     start_time = time.process_time()
