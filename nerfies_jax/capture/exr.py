@@ -42,7 +42,7 @@ def read_exr(path: AnyPath) -> ExrImage:
     Raises:
       CaptureError: If the file cannot be read.
     """
-    path = _existing(path)
+    path = existing(path)
     with decoder.session() as child:
         about, _ = _decode(child, path, True)
         about, channels = _decode(child, path, False, about["numbers"])
@@ -61,7 +61,7 @@ def read_size(path: AnyPath) -> tuple[int, int]:
     Raises:
       CaptureError: If the file cannot be read.
     """
-    path = _existing(path)
+    path = existing(path)
     with decoder.session() as child:
         return tuple(_decode(child, path, True).about["display_size"])
 
@@ -118,7 +118,8 @@ def in_display_window(path: AnyPath, image: ExrImage) -> ExrImage:
     )
 
 
-def _existing(path):
+def existing(path: AnyPath) -> pathlib.Path:
+    """Check that an image exists and may be read."""
     path = pathlib.Path(path)
     if not path.is_file():
         raise CaptureError(f"{path}: no such image; restore it or drop its frame")

@@ -53,7 +53,7 @@ def read_header(path: AnyPath) -> Header:
     path = pathlib.Path(path)
     if path.suffix.lower() == EXR:
         return _check(path, Header(exr.read_size(path), "EXR", 1))
-    _existing(path)
+    exr.existing(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
@@ -66,13 +66,6 @@ def read_header(path: AnyPath) -> Header:
     except _PILLOW_ERRORS as error:
         raise _unreadable(path, error) from None
     return _check(path, header)
-
-
-def _existing(path):
-    """Raise CaptureError if there is no such file or it may not be read."""
-    if not path.is_file():
-        raise CaptureError(f"{path}: no such image; restore it or drop its frame")
-    safe_files.check(path)
 
 
 def _check(path, header):

@@ -186,14 +186,17 @@ def replaced_file(path: AnyPath):
         os.replace(partial, path)
         _sync_folder(path.parent)
     except OSError as error:
-        raise CaptureError(
-            f"{path}: cannot be written ({error.strerror or error}); choose another "
-            "place"
-        ) from None
+        raise _unwritable(path, error) from None
     finally:
         with contextlib.suppress(OSError):  # the disk may have become read-only
             partial.unlink(missing_ok=True)
         _partial_paths.discard(partial)
+
+
+def _unwritable(path, error):
+    return CaptureError(
+        f"{path}: cannot be written ({error.strerror or error}); choose another place"
+    )
 
 
 def _sync_folder(folder):
@@ -454,18 +457,12 @@ def _partial_folder(path, parent):
             tempfile.mkdtemp(prefix=prefix, suffix=".partial", dir=parent)
         )
     except OSError as error:
-        raise CaptureError(
-            f"{path}: cannot be written ({error.strerror or error}); choose another "
-            "place"
-        ) from None
+        raise _unwritable(path, error) from None
     _register(partial)
     try:
         yield partial
     except OSError as error:
-        raise CaptureError(
-            f"{path}: cannot be written ({error.strerror or error}); choose another "
-            "place"
-        ) from None
+        raise _unwritable(path, error) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         _partial_paths.discard(partial)

@@ -184,14 +184,19 @@ def load_array(path: pathlib.Path, most: int, kinds: str = "fiu") -> np.ndarray:
     Raises:
       CaptureError: If it is damaged, larger, or not an array of numbers.
     """
-    try:
-        array = read_npy(path, 8 * most + MAX_HEADER)
-    except safe_files.CaptureError:
-        raise
-    except ValueError as error:
-        raise safe_files.CaptureError(
-            f"{path}: not a readable array ({error}); save it again with numpy.save"
-        ) from None
+    most_bytes = 8 * most + MAX_HEADER
+    with safe_files.open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        try:
+            if size > most_bytes:
+                raise ValueError(f"{size} bytes; at most {most_bytes} are read")
+            array = _read_array(file, size)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise safe_files.CaptureError(
+                f"{path}: not a readable array ({reason}); save it again with "
+                "numpy.save"
+            ) from None
     if array.dtype.kind not in kinds:
         raise safe_files.CaptureError(
             f"{path}: not an array of numbers; save it with numpy.save"
@@ -201,31 +206,6 @@ def load_array(path: pathlib.Path, most: int, kinds: str = "fiu") -> np.ndarray:
             f"{path}: {array.size} numbers; at most {most} are read"
         )
     return array
-
-
-def read_npy(path: AnyPath, most: int = MAX_BYTES) -> np.ndarray:
-    """Read a .npy file.
-
-    Args:
-      path: The file.
-      most: Largest number of bytes of the file.
-
-    Returns:
-      The array.
-
-    Raises:
-      ValueError: If it is damaged or too large, with a one-line reason without the
-        path.
-      CaptureError: If it cannot be opened.
-    """
-    with safe_files.open_file(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise ValueError(f"{size} bytes; at most {most} are read")
-        try:
-            return _read_array(file, size)
-        except OSError as error:
-            raise ValueError(str(error.strerror or error)) from None
 
 
 def _read_array(stream: io.BufferedIOBase, size: int) -> np.ndarray:

@@ -29,13 +29,9 @@ _folder: contextvars.ContextVar[str | None] = contextvars.ContextVar(
 
 
 @contextlib.contextmanager
-def _confine(folder: AnyPath) -> Iterator[None]:
-    """Refuse to open files outside of a folder within the block.
-
-    The restriction does not extend to other threads. Wrap their functions with
-    `carried`.
-    """
-    token = _folder.set(os.path.realpath(folder))
+def _confine(folder: str | None) -> Iterator[None]:
+    """Refuse to open files outside of a real path within the block, in this thread."""
+    token = _folder.set(folder)
     try:
         yield
     finally:
@@ -60,7 +56,7 @@ def confines(
         path: AnyPath, *args: Parameters.args, **options: Parameters.kwargs
     ) -> Content:
         folder = path if os.path.isdir(path) else pathlib.Path(path).parent
-        with _confine(folder), decoder.session():
+        with _confine(os.path.realpath(folder)), decoder.session():
             return read(path, *args, **options)
 
     return confined_read
@@ -78,11 +74,8 @@ def carried(function: Callable[..., Content]) -> Callable[..., Content]:
     folder = _folder.get()
 
     def run(*args: Any) -> Content:
-        token = _folder.set(folder)
-        try:
+        with _confine(folder):
             return function(*args)
-        finally:
-            _folder.reset(token)
 
     return run
 

@@ -172,7 +172,10 @@ def _distortion(entry, transforms, label):
     model = (level.camera_model or "").upper()
     fisheye = model == FISHEYE or bool(level.is_fisheye)
     if model not in PINHOLES | {FISHEYE}:
-        raise _unsupported_model(label, f"camera_model {level.camera_model}")
+        raise CaptureError(
+            f"{label}: camera_model {level.camera_model} is not supported; undistort "
+            "the images to OPENCV or PINHOLE first (ns-process-data or COLMAP do it)"
+        )
     has_other_model = entry.camera_model not in (None, transforms.camera_model)
     # The file's coefficients belong to the file's model.
     level = entry if has_other_model else _level(entry, transforms, DISTORTION)
@@ -193,13 +196,6 @@ def _distortion(entry, transforms, label):
         "tangential": tuple(values[key] for key in ("p1", "p2")),
         "fisheye": None,
     }
-
-
-def _unsupported_model(label, model):
-    return CaptureError(
-        f"{label}: {model} is not supported; undistort the images to OPENCV or PINHOLE "
-        "first (ns-process-data or COLMAP do it)"
-    )
 
 
 def notes(intrinsics: list[Intrinsics], size: tuple[int, int]) -> tuple[str, ...]:

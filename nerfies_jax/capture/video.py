@@ -121,12 +121,10 @@ def transfer_of(path: pathlib.Path) -> Transfer | None:
       The transfer function, None for other videos and for files that cannot be read
       (`read_video` reports the reason).
     """
-    extras.check("av", "video")
     try:
-        about = _request(path, "video_transfer").about
-    except (decoder.DecoderError, CaptureError):
+        return _request(path, "video_transfer").about["transfer"]
+    except CaptureError:
         return None
-    return about["transfer"]
 
 
 def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
@@ -144,11 +142,7 @@ def notes_of(path: pathlib.Path, count: int, last: float) -> tuple[str, ...]:
     Raises:
       CaptureError: If the video cannot be read.
     """
-    extras.check("av", "video")
-    try:
-        answer = _request(path, "video_notes", count=count, last=last)
-    except decoder.DecoderError as error:
-        raise _unreadable(path, error) from None
+    answer = _request(path, "video_notes", count=count, last=last)
     return tuple(answer.about["notes"])
 
 
@@ -164,19 +158,19 @@ def stated_frames(path: pathlib.Path) -> int:
     Raises:
       CaptureError: If the video cannot be read.
     """
-    extras.check("av", "video")
-    try:
-        return _request(path, "video_length").about["frames"]
-    except decoder.DecoderError as error:
-        raise _unreadable(path, error) from None
+    return _request(path, "video_length").about["frames"]
 
 
 def _request(path, operation, **arguments):
+    extras.check("av", "video")
     file = str(safe_files.check(path).absolute())
-    with decoder.session() as child:
-        return child.request(
-            operation, CPU_SECONDS, MEMORY_BYTES, path=file, **arguments
-        )
+    try:
+        with decoder.session() as child:
+            return child.request(
+                operation, CPU_SECONDS, MEMORY_BYTES, path=file, **arguments
+            )
+    except decoder.DecoderError as error:
+        raise _unreadable(path, error) from None
 
 
 def _unreadable(path, error):
