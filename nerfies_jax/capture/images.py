@@ -7,8 +7,8 @@ and in memory. Linear light from EXR is converted to sRGB.
 import contextlib
 import pathlib
 import warnings
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import imageio.v3
 import numpy as np
@@ -64,7 +64,7 @@ def read_header(path: AnyPath) -> Header:
             f"{path}: more than {MAX_PIXELS} pixels; make the image smaller first"
         ) from None
     except _PILLOW_ERRORS as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
     return _check(path, header)
 
 
@@ -115,7 +115,7 @@ def read_pixels(path: AnyPath, orientation: str = "refuse") -> np.ndarray:
             "remove the tag"
         )
     if header.size[0] * header.size[1] > LARGE_PIXELS:
-        pixels = decode_apart("image", path, header).arrays["pixels"]
+        pixels = decode_apart("image", path, header.size, unreadable).arrays["pixels"]
     else:
         pixels = decode(path, header)
     if pixels.dtype == np.bool_:
@@ -170,17 +170,25 @@ def decode(path: AnyPath, header: Header | None = None) -> np.ndarray:
     except CaptureError:
         raise
     except _PILLOW_ERRORS as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
     return pixels
 
 
-def decode_apart(operation: str, path: pathlib.Path, header: Header) -> decoder.Answer:
+def decode_apart(
+    operation: str,
+    path: pathlib.Path,
+    size: tuple[int, int],
+    unreadable: Callable[[pathlib.Path, Exception], CaptureError],
+    **arguments: Any,
+) -> decoder.Answer:
     """Decode a large image in a child process with limits.
 
     Args:
       operation: Operation of `decoder_child` that takes a path.
       path: The file.
-      header: Its header.
+      size: Width and height in pixels, which the limits depend on.
+      unreadable: Makes the error for a file that cannot be decoded.
+      **arguments: Further arguments of the operation.
 
     Returns:
       The answer of the child.
@@ -188,7 +196,7 @@ def decode_apart(operation: str, path: pathlib.Path, header: Header) -> decoder.
     Raises:
       CaptureError: If it cannot be decoded.
     """
-    count = header.size[0] * header.size[1]
+    count = size[0] * size[1]
     try:
         with decoder.session() as child:
             return child.request(
@@ -196,11 +204,12 @@ def decode_apart(operation: str, path: pathlib.Path, header: Header) -> decoder.
                 cpu_seconds=count * SECONDS_PER_PIXEL,
                 memory_bytes=BYTES_PER_PIXEL * count,
                 path=str(path.absolute()),
+                **arguments,
             )
     except decoder.DecoderError as error:
         if error.has_advice:  # the message is that of a CaptureError, with the path
             raise CaptureError(str(error)) from None
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
 
 
 @contextlib.contextmanager
@@ -223,7 +232,7 @@ def opened(path: AnyPath) -> Iterator[PIL.Image.Image]:
     except CaptureError:
         raise
     except _PILLOW_ERRORS as error:
-        raise _unreadable(path, error) from None
+        raise unreadable(path, error) from None
 
 
 def read_numbers(path: AnyPath) -> np.ndarray:
@@ -341,7 +350,8 @@ def write_png(path: AnyPath, pixels: np.ndarray):
         partial.write_bytes(png_bytes)
 
 
-def _unreadable(path, error):
+def unreadable(path: AnyPath, error: Exception) -> CaptureError:
+    """Make the error of an image that cannot be decoded."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return CaptureError(
         f"{path}: not a readable image ({reason}); it may be truncated, so copy or "

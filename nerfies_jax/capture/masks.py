@@ -240,7 +240,7 @@ def _read(path, orientation):
         )
     if header.size[0] * header.size[1] <= images.LARGE_PIXELS:
         return decode(path)
-    answer = images.decode_apart("mask", path, header)
+    answer = images.decode_apart("mask", path, header.size, images.unreadable)
     value, alpha = answer.arrays["value"], answer.arrays.get("alpha")
     return Stored(value, alpha, answer.about["full"], answer.about["colorful"])
 

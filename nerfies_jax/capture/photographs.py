@@ -16,7 +16,7 @@ import numpy as np
 import PIL.Image
 import PIL.ImageOps
 
-from nerfies_jax.capture import decoder, images, safe_files
+from nerfies_jax.capture import images, safe_files
 from nerfies_jax.capture.errors import CaptureError
 
 HEIC = (".heic", ".heif")  # read if pillow-heif is installed
@@ -65,7 +65,7 @@ def read_header(path: pathlib.Path) -> Header:
     """
     if path.suffix.lower() not in HEIC:
         return decode_header(path)
-    about = _decode_apart(path, 0, header_only=True).about
+    about = _decode_apart(path, (0, 0), header_only=True).about
     return Header(tuple(about["size"]), about["focal"], about["camera"])
 
 
@@ -82,29 +82,18 @@ def read_upright(path: pathlib.Path) -> np.ndarray:
       Unreadable: If it is damaged.
       CaptureError: If its values have an unknown range.
     """
-    width, height = read_header(path).size
-    count = width * height
-    if path.suffix.lower() not in HEIC and count <= images.LARGE_PIXELS:
+    size = read_header(path).size
+    if path.suffix.lower() not in HEIC and size[0] * size[1] <= images.LARGE_PIXELS:
         return decode_upright(path)
-    return _decode_apart(path, count, header_only=False).arrays["pixels"]
+    return _decode_apart(path, size, header_only=False).arrays["pixels"]
 
 
-def _decode_apart(path, count, header_only):
-    """Decode a file of `count` pixels in a child process."""
+def _decode_apart(path, size, header_only):
+    """Decode a file in a child process, with errors of this module."""
     path = safe_files.check(path)
-    try:
-        with decoder.session() as child:
-            answer = child.request(
-                "photograph",
-                cpu_seconds=count * images.SECONDS_PER_PIXEL,
-                memory_bytes=count * images.BYTES_PER_PIXEL,
-                path=str(path.absolute()),
-                header_only=header_only,
-            )
-    except decoder.DecoderError as error:
-        if error.has_advice:  # the message is that of a CaptureError, with the path
-            raise CaptureError(str(error)) from None
-        raise _unreadable(path, error) from None
+    answer = images.decode_apart(
+        "photograph", path, size, _unreadable, header_only=header_only
+    )
     if "refused" in answer.about:
         kind = TooLarge if answer.about["refused"] == TooLarge.__name__ else Unreadable
         raise kind(answer.about["message"])
