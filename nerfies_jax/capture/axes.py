@@ -6,6 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerfies_jax.capture.capture import Capture
+from nerfies_jax.capture.world_points import mean_up
+from nerfies_jax.geometry import camera
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 # Length of the mean of unit vectors, below which they have no common direction.
@@ -14,8 +16,7 @@ LEAST_AGREEMENT = 0.2
 
 def _up_of(capture: Capture) -> np.ndarray:
     """Estimate the direction that is up, as the mean of what is up in the images."""
-    rows = np.asarray(capture.cameras.camera_from_world, np.float64)[capture.train]
-    mean = -rows[:, 1].mean(axis=0)
+    mean = mean_up(camera.take(capture.cameras, capture.train))
     length = np.linalg.norm(mean)
     if length < LEAST_AGREEMENT:
         raise ValueError(

@@ -6,6 +6,7 @@ import numpy as np
 
 from nerfies_jax.capture.capture import Capture
 from nerfies_jax.capture.nearest import known_names
+from nerfies_jax.capture.world_points import mean_up
 from nerfies_jax.geometry import camera as cameras
 from nerfies_jax.geometry.camera import Camera
 from nerfies_jax.geometry.rays import across_ray
@@ -53,7 +54,7 @@ def planned(kind: str, capture: Capture, count: int) -> CameraPath:
     return CameraPath(path(kind, capture, count), capture.size, times)
 
 
-def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
+def path(kind: str, capture: Capture, count: int) -> Camera:
     """Make cameras that move around the scene.
 
     "sway" stays within the range of the captured positions, where a monocular
@@ -67,7 +68,6 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
       kind: One of `KINDS`.
       capture: The capture to look at.
       count: Number of cameras.
-      turns: Number of periods of a closed path.
 
     Returns:
       Cameras in scene units, [count].
@@ -83,7 +83,7 @@ def path(kind: str, capture: Capture, count: int, turns: float = 1.0) -> Camera:
     if kind == "stabilized":
         train_times = capture.times[capture.train].astype(np.float64)
         return smoothed(train_cameras, train_times, _even_times(capture, count))
-    phase = np.linspace(0, 2 * np.pi * turns, count, endpoint=False)
+    phase = np.linspace(0, 2 * np.pi, count, endpoint=False)
     target = focus_point(train_cameras, capture.near, capture.far)
     min_sine = LEAST_ORBIT if kind == "orbit" else LEAST_TILT
     up = _usable_up(up_axis(capture), train_cameras, target, min_sine)
@@ -208,20 +208,7 @@ def up_axis(capture: Capture) -> np.ndarray:
     """
     if capture.up is not None:
         return np.asarray(capture.up, np.float64)
-    return mean_up(cameras.take(capture.cameras, capture.train))
-
-
-def mean_up(train_cameras: Camera) -> np.ndarray:
-    """Return the mean of the up directions of images.
-
-    Args:
-      train_cameras: Cameras, [frames].
-
-    Returns:
-      A unit vector, [3].
-    """
-    down = np.asarray(train_cameras.camera_from_world, np.float64)[:, 1, :]
-    up = -down.mean(axis=0)
+    up = mean_up(cameras.take(capture.cameras, capture.train))
     return up / np.linalg.norm(up)
 
 

@@ -27,6 +27,11 @@ def unit(up: Sequence[float] | None) -> tuple[float, float, float] | None:
     return tuple((np.array(up) / np.linalg.norm(up)).tolist())
 
 
+def mean_up(cameras: Camera) -> np.ndarray:
+    """Return the mean of the up directions of cameras, [3], shorter than one."""
+    return -np.asarray(cameras.camera_from_world, np.float64)[:, 1].mean(axis=0)
+
+
 def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
     """Return the mean up direction of cameras.
 
@@ -36,7 +41,7 @@ def up_direction(cameras: Camera) -> tuple[float, float, float] | None:
     Returns:
       A unit vector, or None if the directions cancel.
     """
-    mean = -cameras.camera_from_world[:, 1].astype(np.float64).mean(0)
+    mean = mean_up(cameras)
     length = np.linalg.norm(mean)
     if length < 0.1:  # the up directions cancel
         return None

@@ -49,10 +49,6 @@ def test_axes_that_meet_behind_the_cameras_are_not_believed():
     assert offset @ flipped.camera_from_world[:, 2, :].mean(axis=0) > 0
 
 
-def test_up_is_the_mean_of_the_images_up():
-    np.testing.assert_allclose(camera_paths.mean_up(rig(np.zeros(3)))[1], 1, atol=0.05)
-
-
 @pytest.mark.parametrize("kind", camera_paths.KINDS)
 def test_every_path_looks_at_the_scene_with_proper_rotations(kind):
     capture = scenes.tiny_capture()
