@@ -183,7 +183,6 @@ def _unreadable(path, error):
 
 def read_video(
     path: AnyPath,
-    stride: int = 1,
     most: int = 2**31,
     rows: Collection[int] | None = None,
     gray: bool = False,
@@ -197,7 +196,6 @@ def read_video(
 
     Args:
       path: The video.
-      stride: Read every `stride`-th frame.
       most: Largest number of frames to read.
       rows: Numbers of the frames to return, None for all. Nothing after the last of
         them is decoded.
@@ -224,7 +222,6 @@ def read_video(
             CPU_SECONDS,
             MEMORY_BYTES,
             path=str(path.absolute()),
-            stride=int(stride),
             most=int(most),
             rows=None if rows is None else sorted(map(int, rows)),
             gray=gray,

@@ -21,17 +21,9 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 def frames(
-    path: str, stride: int, most: int, rows: list[int] | None, gray: bool, damaged: str
+    path: str, most: int, rows: list[int] | None, gray: bool, damaged: str
 ) -> Iterator[Reply]:
-    """Decode frames, for `video.read_video`.
-
-    Args:
-      path: The video.
-      stride: As for `video.read_video`.
-      most: As for `video.read_video`.
-      rows: As for `video.read_video`.
-      gray: As for `video.read_video`.
-      damaged: As for `video.read_video`.
+    """Decode frames, with the arguments of `video.read_video`.
 
     Yields:
       Seconds and pixels of a frame, or empty dicts for a frame that is skipped.
@@ -56,9 +48,7 @@ def frames(
                     f"{frame.width}x{frame.height} pixels at frame {number}; cut the "
                     "video there"
                 )
-            if number % stride or not (
-                requested_rows is None or number in requested_rows
-            ):
+            if requested_rows is not None and number not in requested_rows:
                 yield {}, {}
                 continue
             if count >= most:
@@ -79,14 +69,7 @@ def frames(
 
 
 def transfer(path: str) -> Iterator[Reply]:
-    """Find the transfer function of an HDR video.
-
-    Args:
-      path: The video.
-
-    Yields:
-      The transfer function, None for other videos.
-    """
+    """Find the transfer function of an HDR video, None for other videos."""
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         frame = next(container.decode(_main_stream(container)), None)
@@ -95,14 +78,7 @@ def transfer(path: str) -> Iterator[Reply]:
 
 
 def length(path: str) -> Iterator[Reply]:
-    """Read the number of frames of a video from its header.
-
-    Args:
-      path: The video.
-
-    Yields:
-      The number of frames.
-    """
+    """Read the number of frames of a video from its header."""
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         stream = _main_stream(container)
@@ -112,16 +88,7 @@ def length(path: str) -> Iterator[Reply]:
 
 
 def notes(path: str, count: int, last: float) -> Iterator[Reply]:
-    """Describe anything unusual about a video, for `video.notes_of`.
-
-    Args:
-      path: The video.
-      count: Number of frames that could be read.
-      last: Time of the last one in seconds.
-
-    Yields:
-      Notes.
-    """
+    """Describe anything unusual about a video, for `video.notes_of`."""
     av = extras.library("av", "video")
     with _words_of(av), av.open(path) as container:
         yield {"notes": _notes(container, count, last)}, {}

@@ -78,10 +78,8 @@ def test_the_file_says_which_colors_it_holds(tmp_path):
         assert stream.pix_fmt == "yuv420p"
 
 
-def test_every_other_frame_and_at_most_so_many(tmp_path):
+def test_at_most_so_many_frames_are_read(tmp_path):
     video.write_video(tmp_path / "a.mp4", make_frames(), 10)
-    times = [seconds for seconds, _ in video.read_video(tmp_path / "a.mp4", stride=3)]
-    assert times == pytest.approx([0, 0.3, 0.6], abs=1e-4)
     assert len(list(video.read_video(tmp_path / "a.mp4", most=2))) == 2
 
 
