@@ -14,17 +14,10 @@ SMALLEST = 1e-3  # share of the image; smaller regions are shadows at the border
 LARGEST = 0.25  # share of the image; larger regions are a dark scene
 
 
-def black_borders(images: np.ndarray) -> np.ndarray | None:
-    """Find black regions that touch the border of an image.
+def _black_borders(images):
+    """Black regions that touch the border, [frames, height, width], None without any.
 
-    The regions are dilated by two pixels, since resampling mixed their edges with
-    black.
-
-    Args:
-      images: uint8 images, [frames, height, width, 3].
-
-    Returns:
-      Booleans [frames, height, width], or None if there are no such regions.
+    They are dilated by two pixels, since resampling mixed their edges with black.
     """
     borders = None
     for row, image in enumerate(images):  # one at a time, to save memory
@@ -59,7 +52,7 @@ def without_black_borders(
     Returns:
       The mask, None if all pixels are observed, and a note if there are borders.
     """
-    borders = black_borders(images)
+    borders = _black_borders(images)
     if borders is None:
         return valid, ()
     count = int(borders.any((1, 2)).sum())

@@ -27,14 +27,7 @@ class Look(NamedTuple):
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check if the cameras look at one point, or would under another convention.
-
-    Args:
-      capture: The capture, without points.
-
-    Returns:
-      The findings.
-    """
+    """Check if the cameras look at one point, or would under another convention."""
     rotation = np.asarray(capture.cameras.camera_from_world, np.float64)
     position = np.asarray(capture.cameras.position, np.float64) / capture.scale
     position = position + np.array(capture.center)

@@ -22,14 +22,7 @@ _MASKS = (
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check brightness, shares of observed and moving pixels, and times.
-
-    Args:
-      capture: The capture.
-
-    Returns:
-      The findings.
-    """
+    """Check brightness, shares of observed and moving pixels, and times."""
     return [
         _brightness(capture),
         *_find_unobserved(capture),

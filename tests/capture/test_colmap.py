@@ -11,7 +11,7 @@ import scipy.spatial.transform
 
 from nerfies_jax import capture as room
 from nerfies_jax.capture import colmap, decoder, frames, world_points
-from nerfies_jax.capture.borders import black_borders
+from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
 from tests.capture.broken import refused
@@ -284,13 +284,12 @@ def test_black_wedges_at_the_rim_are_not_observed():
     images[1, 20:24, 20:24] = 0  # a dark thing inside
     images[2] = 0  # a dark scene
     images[3, :6, 10:40] = np.random.default_rng(0).integers(0, 3, (6, 30, 3))  # cloth
-    borders = black_borders(images)
-    assert not borders[0].any()
-    assert not borders[2:].any()
-    expected = np.zeros((40, 50), bool)
-    expected[:8, 8:42] = True  # and two pixels around
-    np.testing.assert_array_equal(borders[1], expected)
-    assert black_borders(images[:1]) is None
+    valid, (note,) = without_black_borders(images, None)
+    assert note.startswith("1 frames have black borders")
+    expected = np.ones(valid.shape, bool)
+    expected[1, :8, 8:42] = False  # and two pixels around
+    np.testing.assert_array_equal(valid, expected)
+    assert without_black_borders(images[:1], None) == (None, ())
 
 
 def spoil_text(name, old, new):
