@@ -1,6 +1,5 @@
 """transforms*.json: Blender, D-NeRF and nerfstudio, read and refused."""
 
-import json
 import math
 
 import numpy as np
@@ -11,15 +10,10 @@ import pytest
 from nerfies_jax import capture as room
 from nerfies_jax.capture import blender_format, points, world_points
 from nerfies_jax.capture.capture import CaptureError
-from tests.capture.broken import refused
+from tests.capture.broken import dump, edited, refused
 
 SIZE = (10, 8)
 ANGLE = 0.7
-
-
-def dump(path, value):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value))
 
 
 def pose(turn, radius=4.0):
@@ -130,10 +124,8 @@ def test_times_that_are_missing(tmp_path):
     order = np.argsort([int(name.split("_")[-1]) for name in video.ids])
     np.testing.assert_allclose(video.times[order], np.linspace(0, 1, 12), atol=1e-7)
     make(tmp_path / "some")
-    file = tmp_path / "some/transforms_train.json"
-    table = json.loads(file.read_text())
-    del table["frames"][1]["time"]
-    dump(file, table)
+    with edited(tmp_path / "some/transforms_train.json") as table:
+        del table["frames"][1]["time"]
     some = blender_format.read(tmp_path / "some")
     assert some.times[1] == pytest.approx(1 / 3)
     assert any("1 frames have no time" in note for note in some.notes)
@@ -151,13 +143,13 @@ def test_times_that_are_missing(tmp_path):
 )
 def test_folders_of_one_time_are_cameras(tmp_path, split, folders, times, expected):
     file = make(tmp_path, {split[1:]: 4, "test": 4}) / f"transforms{split}.json"
-    table = json.loads(file.read_text())
     for folder in {*folders}:
         (tmp_path / folder).symlink_to(tmp_path / (split[1:] or "images"))
-    for row, entry in enumerate(table["frames"]):
-        name = f"{folders[row % 2]}/r_{row}"
-        entry |= {"file_path": name, "time": int(times[row]) / 4}
-    dump(file, table | {"is_fisheye": False})
+    with edited(file) as table:
+        for row, entry in enumerate(table["frames"]):
+            name = f"{folders[row % 2]}/r_{row}"
+            entry |= {"file_path": name, "time": int(times[row]) / 4}
+        table["is_fisheye"] = False
     capture = blender_format.read(tmp_path)
     assert np.unique(capture.camera_ids).tolist() == expected
     right = capture.camera_ids[[name.startswith("right") for name in capture.ids]]
@@ -194,10 +186,8 @@ def test_nerfstudio_lens_scales_with_the_images(tmp_path):
 
 def test_a_frame_may_have_its_own_lens(tmp_path):
     make(tmp_path, {"": 9}, top=LENS)
-    file = tmp_path / "transforms.json"
-    table = json.loads(file.read_text())
-    table["frames"][3]["fl_x"] = 80.0
-    dump(file, table)
+    with edited(tmp_path / "transforms.json") as table:
+        table["frames"][3]["fl_x"] = 80.0
     capture = blender_format.read(tmp_path)
     focal = dict(zip(capture.ids, capture.cameras.focal_px, strict=True))
     assert focal["images_r_3"] == pytest.approx(40)
@@ -206,8 +196,8 @@ def test_a_frame_may_have_its_own_lens(tmp_path):
 
 def test_the_held_out_file_has_its_own_lens(tmp_path):
     make(tmp_path)
-    table = json.loads((tmp_path / "transforms_test.json").read_text())
-    dump(tmp_path / "transforms_test.json", table | {"camera_angle_x": 1.4})
+    with edited(tmp_path / "transforms_test.json") as table:
+        table["camera_angle_x"] = 1.4
     focal = blender_format.read(tmp_path).cameras.focal_px
     np.testing.assert_allclose(focal[-1], 5 / math.tan(0.7), rtol=1e-6)
     np.testing.assert_allclose(focal[0], 5 / math.tan(0.35), rtol=1e-6)
@@ -215,21 +205,19 @@ def test_the_held_out_file_has_its_own_lens(tmp_path):
 
 def test_nerfstudio_points_masks_and_lists(tmp_path):
     make(tmp_path, {"": 9}, top=LENS)
-    file = tmp_path / "transforms.json"
-    table = json.loads(file.read_text())
     mask = np.ones((8, 10), np.uint8)  # of 0 and 1: black to the eye
     mask[1, 2] = 0
     (tmp_path / "masks").mkdir()
     PIL.Image.fromarray(mask).save(tmp_path / "masks/m.png")
-    table["frames"][0]["mask_path"] = "masks/m.png"
-    names = [entry["file_path"] for entry in table["frames"]]
-    table |= {
-        "ply_file_path": "sparse.ply",
-        "train_filenames": names[:7],
-        "val_filenames": names[7:8],
-        "test_filenames": names[8:],
-    }
-    dump(file, table)
+    with edited(tmp_path / "transforms.json") as table:
+        table["frames"][0]["mask_path"] = "masks/m.png"
+        names = [entry["file_path"] for entry in table["frames"]]
+        table |= {
+            "ply_file_path": "sparse.ply",
+            "train_filenames": names[:7],
+            "val_filenames": names[7:8],
+            "test_filenames": names[8:],
+        }
     rng = np.random.default_rng(0)
     rows = np.zeros(50, "f4, f4, f4, u1, u1, u1")
     rows.dtype.names = ("x", "y", "z", "red", "green", "blue")
@@ -273,10 +261,9 @@ def test_colors_of_points_are_bytes_or_shares(tmp_path):
 
 def test_of_frames_listed_to_learn_from_alone_some_are_held_out(tmp_path):
     make(tmp_path, {"": 9}, top=LENS)
-    file = tmp_path / "transforms.json"
-    table = json.loads(file.read_text())
-    names = [entry["file_path"] for entry in table["frames"]]
-    dump(file, table | {"train_filenames": names[1:]})
+    with edited(tmp_path / "transforms.json") as table:
+        names = [entry["file_path"] for entry in table["frames"]]
+        table["train_filenames"] = names[1:]
     capture = blender_format.read(tmp_path)
     assert sorted(name[-1] for name in capture.ids) == list("12345678")
     assert [capture.ids[row][-1] for row in capture.heldout] == ["5"]
@@ -297,18 +284,16 @@ def test_missing_images_are_listed_or_left_out(tmp_path):
 
 def first_frame(**changes):
     def spoil(root):
-        file = root / "transforms_train.json"
-        table = json.loads(file.read_text())
-        table["frames"][0] |= changes
-        dump(file, table)
+        with edited(root / "transforms_train.json") as table:
+            table["frames"][0] |= changes
 
     return spoil
 
 
 def top_level(**changes):
     def spoil(root):
-        file = root / "transforms_train.json"
-        dump(file, json.loads(file.read_text()) | changes)
+        with edited(root / "transforms_train.json") as table:
+            table |= changes
 
     return spoil
 

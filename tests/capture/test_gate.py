@@ -52,14 +52,6 @@ def test_depths_that_are_doubtful_are_said():
     assert "no pixel has one above 0" in gate.checked(none).notes[-1]
 
 
-def test_a_stored_capture_in_millimeters_is_refused(tmp_path):
-    nerfies_format.write(tiny_capture(), tmp_path / "a")
-    for file in (tmp_path / "a/depth/1x").glob("*.npy"):
-        np.save(file, 1000 * np.load(file))
-    with pytest.raises(CaptureError, match="millimeters"):
-        formats.load(tmp_path / "a")
-
-
 def test_depth_files_that_are_not_read_are_said(tmp_path):
     nerfies_format.write(tiny_capture(), tmp_path / "a")
     folder = tmp_path / "a/depth/1x"

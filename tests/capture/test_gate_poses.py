@@ -1,14 +1,13 @@
 """Poses of transforms.json in other conventions are recognized from the points."""
 
-import json
-
 import numpy as np
 import plyfile
 import pytest
 
 from nerfies_jax.capture import formats
 from nerfies_jax.capture.capture import CaptureError
-from tests.capture.test_blender_format import dump, make
+from tests.capture.broken import edited
+from tests.capture.test_blender_format import make
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 CONVENTIONS = {
@@ -20,13 +19,10 @@ CONVENTIONS = {
 
 def with_points(root, convert, shift=0.0):
     make(root, {"": 6}, top={"fl_x": 9.0, "ply_file_path": "a.ply"})
-    file = root / "transforms.json"
-    table = json.loads(file.read_text())
-    for entry in table["frames"]:
-        entry["transform_matrix"] = convert(
-            np.array(entry["transform_matrix"])
-        ).tolist()
-    dump(file, table)
+    with edited(root / "transforms.json") as table:
+        for entry in table["frames"]:
+            pose = np.array(entry["transform_matrix"])
+            entry["transform_matrix"] = convert(pose).tolist()
     rows = np.random.default_rng(0).uniform(-1, 1, (200, 3)) + shift
     vertex = np.array([tuple(row) for row in rows], [(axis, "<f4") for axis in "xyz"])
     plyfile.PlyData([plyfile.PlyElement.describe(vertex, "vertex")]).write(

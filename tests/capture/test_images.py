@@ -169,14 +169,6 @@ def test_laying_over_a_background(tmp_path):
     assert np.abs(pixels - exact).max() <= 0.5 + 1e-4
 
 
-def test_an_image_comes_back_as_it_was_written(tmp_path):
-    images.write_png(tmp_path / "a.png", COLOR)
-    np.testing.assert_array_equal(images.read_image(tmp_path / "a.png")[0], COLOR)
-    images.write_png(tmp_path / "m.png", ALPHA > 100)
-    np.testing.assert_array_equal(masks.read_mask(tmp_path / "m.png"), ALPHA > 100)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "m.png"]
-
-
 def test_srgb_curves_are_the_standard_and_each_others_inverse():
     light = np.linspace(0, 1, 10_001)
     # IEC 61966-2-1, one number at a time

@@ -1,7 +1,6 @@
 """LLFF folders against the COLMAP model of the same cameras; broken ones refused."""
 
 import dataclasses
-import json
 import shutil
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from nerfies_jax import capture as room
 from nerfies_jax.capture import images, llff_format, nerfies_format
 from tests.capture import test_colmap as models
-from tests.capture.broken import refused
+from tests.capture.broken import edited, refused
 
 BOUNDS = (4.0, 9.0)
 COUNT = 9
@@ -104,10 +103,8 @@ def test_a_nerfies_directory_takes_the_points_of_the_model_beside_it(tmp_path):
         capture.points.position, known.points.position, atol=1e-6
     )
     np.testing.assert_array_equal(capture.points.color, known.points.color)
-    file = tmp_path / "out/camera/f_000.json"
-    one = json.loads(file.read_text())
-    one["position"][0] += 0.1
-    file.write_text(json.dumps(one))
+    with edited(tmp_path / "out/camera/f_000.json") as one:
+        one["position"][0] += 0.1
     capture = room.load(tmp_path / "out")
     assert capture.points is None
     assert any("has other cameras" in note for note in capture.notes)

@@ -1,7 +1,6 @@
 """Nerfies-like directories: what is read, what is refused, and the round trip."""
 
 import dataclasses
-import json
 
 import jax
 import numpy as np
@@ -11,15 +10,10 @@ import pytest
 from nerfies_jax.capture import nerfies_format, nerfies_views, world_points
 from nerfies_jax.capture.capture import CaptureError, PointCloud
 from nerfies_jax.geometry import camera
-from tests.capture.broken import refused
+from tests.capture.broken import dump, edited, refused
 
 SIZE = (12, 8)
 SCENE = {"scale": 0.5, "center": [1.0, -2.0, 3.0], "near": 0.2, "far": 1.5}
-
-
-def dump(path, value):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value))
 
 
 def save_image(path, pixels):
@@ -70,10 +64,6 @@ def make(folder, count=6, factors=(1,), channels=3):
                 image(row, size, channels),
             )
     return folder
-
-
-def edit(file, **changes):
-    dump(file, json.loads(file.read_text()) | changes)
 
 
 def test_everything_in_the_files_arrives(tmp_path):
@@ -316,7 +306,11 @@ def written(name, value):
 
 
 def changed(name, **changes):
-    return lambda folder: edit(folder / name, **changes)
+    def spoil(folder):
+        with edited(folder / name) as table:
+            table |= changes
+
+    return spoil
 
 
 def one_camera(**changes):
@@ -414,15 +408,6 @@ def test_a_broken_directory_is_refused_in_one_line(tmp_path, case):
     spoil, refusal = BAD[case]
     spoil(tmp_path)
     refused(nerfies_format.read, tmp_path, refusal)
-
-
-def test_a_symbolic_link_out_of_the_capture_is_refused(tmp_path):
-    make(tmp_path / "scene")
-    secret = tmp_path / "secret.json"
-    (tmp_path / "scene/camera/001.json").rename(secret)
-    (tmp_path / "scene/camera/001.json").symlink_to(secret)
-    with pytest.raises(CaptureError, match="leads outside"):
-        nerfies_format.read(tmp_path / "scene")
 
 
 def full_capture(tmp_path):
@@ -533,10 +518,9 @@ def test_metadata_without_times_takes_those_of_the_names(tmp_path):
     """They were all 0, so that a moving scene was read as a static one."""
     make(tmp_path)
     file = tmp_path / "metadata.json"
-    table = json.loads(file.read_text())
-    for entry in table.values():
-        del entry["warp_id"]
-    dump(file, table)
+    with edited(file) as table:
+        for entry in table.values():
+            del entry["warp_id"]
     views = nerfies_views.read_cameras(tmp_path)
     np.testing.assert_allclose(views.times, np.linspace(0, 1, 6), atol=1e-6)
     assert views.warp_ids.tolist() == list(range(6))
@@ -550,17 +534,17 @@ def test_metadata_without_times_takes_those_of_the_names(tmp_path):
 
 def test_keys_that_are_not_read_are_named(tmp_path):
     make(tmp_path)
+    dump(tmp_path / "extra.json", {})
     assert not any("not read" in note for note in nerfies_format.read(tmp_path).notes)
     for name, keys in (
         ("scene.json", {"rotation": 1}),
         ("extra.json", {"bbox": [], "mirror": True}),
         ("camera/000.json", {"shutter": 0.1}),
     ):
-        file = tmp_path / name
-        dump(file, (json.loads(file.read_text()) if file.exists() else {}) | keys)
-    entries = json.loads((tmp_path / "metadata.json").read_text())
-    entries["003"]["exposure"] = 2.0
-    dump(tmp_path / "metadata.json", entries)
+        with edited(tmp_path / name) as table:
+            table |= keys
+    with edited(tmp_path / "metadata.json") as entries:
+        entries["003"]["exposure"] = 2.0
     notes = nerfies_format.read(tmp_path).notes
     for file, key in (
         ("scene.json", "rotation"),

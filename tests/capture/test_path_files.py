@@ -12,6 +12,7 @@ from nerfies_jax.capture.camera_paths import CameraPath
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.keyframes import Keyframe
 from nerfies_jax.geometry import camera
+from tests.capture.broken import edited
 from tests.capture.test_camera_files import hand_made
 
 SIZE = (64, 36)
@@ -79,10 +80,8 @@ def test_a_nerfies_path_keeps_a_fisheye_and_refuses_half_of_one(tmp_path):
     path_files.write_nerfies(tmp_path / "path", planned, capture)
     read = path_files.read(tmp_path / "path", capture)
     np.testing.assert_allclose(read.cameras.fisheye, lens, rtol=1e-6)
-    file = tmp_path / "path" / "000001.json"
-    entry = json.loads(file.read_text())
-    del entry["fisheye_distortion"]
-    file.write_text(json.dumps(entry))
+    with edited(tmp_path / "path" / "000001.json") as entry:
+        del entry["fisheye_distortion"]
     with pytest.raises(CaptureError, match="1 of 3 cameras have no fisheye"):
         path_files.read(tmp_path / "path", capture)
 
@@ -113,9 +112,8 @@ def change(table, **first):
 )
 def test_a_path_that_cannot_be_rendered_is_refused(spoil, words, tmp_path):
     path_files.write_nerfstudio(tmp_path / "a.json", a_path(), 24.0)
-    table = json.loads((tmp_path / "a.json").read_text())
-    spoil(table)
-    (tmp_path / "a.json").write_text(json.dumps(table))
+    with edited(tmp_path / "a.json") as table:
+        spoil(table)
     with pytest.raises(CaptureError, match=words) as caught:
         path_files.read(tmp_path / "a.json", hand_made(frames=3))
     assert str(caught.value).startswith(str(tmp_path / "a.json"))
@@ -126,9 +124,8 @@ def test_folders_of_no_cameras_or_of_several_sizes_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="no camera files"):
         path_files.read(tmp_path, capture)
     path_files.write_nerfies(tmp_path / "path", a_path(), capture)
-    entry = tmp_path / "path" / "000002.json"
-    table = json.loads(entry.read_text()) | {"image_size": [32, 36]}
-    entry.write_text(json.dumps(table))
+    with edited(tmp_path / "path" / "000002.json") as entry:
+        entry["image_size"] = [32, 36]
     with pytest.raises(CaptureError, match="all images of a video have one size"):
         path_files.read(tmp_path / "path", capture)
     with pytest.raises(

@@ -1,7 +1,6 @@
 """Files from strangers: links out of a capture, bombs, pipes and headers that lie."""
 
 import io
-import json
 import os
 import zipfile
 
@@ -22,6 +21,7 @@ from nerfies_jax.capture import (
 )
 from nerfies_jax.capture.capture import CaptureError
 from tests.capture import test_blender_format, test_colmap, test_nerfies_format
+from tests.capture.broken import edited
 
 
 def nerfies(root):
@@ -228,9 +228,8 @@ def test_a_file_that_grows_over_its_budget_is_refused(tmp_path):
 
 def test_names_longer_than_the_system_allows_are_refused(tmp_path):
     blender(tmp_path)
-    table = json.loads((tmp_path / "transforms_train.json").read_text())
-    table["frames"][0]["file_path"] = "a" * 5000
-    (tmp_path / "transforms_train.json").write_text(json.dumps(table))
+    with edited(tmp_path / "transforms_train.json") as table:
+        table["frames"][0]["file_path"] = "a" * 5000
     with pytest.raises(CaptureError, match="missing"):
         blender_format.read(tmp_path)
 

@@ -13,6 +13,7 @@ from nerfies_jax.capture import points, text_files
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.json_files import named_file, read_json
 from tests.capture import test_blender_format, test_colmap, test_nerfies_format
+from tests.capture.broken import edited
 
 UNICODE = ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32")
 
@@ -96,12 +97,11 @@ def test_other_spellings_lead_nowhere_outside(name, tmp_path):
 @pytest.mark.parametrize("folder", ["/home/me/scene/", "C:\\me\\", "../scene/"])
 def test_paths_of_another_machine_are_those_of_this_folder(folder, tmp_path):
     expected = room.load(test_blender_format.make(tmp_path, {"": 6}))
-    path = tmp_path / "transforms.json"
-    content = json.loads(path.read_text())
-    for entry in content["frames"]:
-        name = entry["file_path"].removeprefix("./")
-        entry["file_path"] = folder + name.replace("/", "\\" if "C" in folder else "/")
-    path.write_text(json.dumps(content))
+    with edited(tmp_path / "transforms.json") as content:
+        for entry in content["frames"]:
+            name = entry["file_path"].removeprefix("./")
+            name = name.replace("/", "\\" if "C" in folder else "/")
+            entry["file_path"] = folder + name
     read = room.load(tmp_path)
     assert read.ids == expected.ids
     np.testing.assert_array_equal(read.images, expected.images)

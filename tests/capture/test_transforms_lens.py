@@ -1,6 +1,5 @@
 """Intrinsics of transforms*.json, of the file and of its frames."""
 
-import json
 import math
 
 import numpy as np
@@ -8,20 +7,19 @@ import pytest
 
 from nerfies_jax.capture import blender_format
 from nerfies_jax.capture.capture import CaptureError
-from tests.capture.test_blender_format import dump, make
+from tests.capture.broken import edited
+from tests.capture.test_blender_format import make
 
 
-def in_frame(top, frame, number=0):
+def in_frame(top, frame):
     """Cameras of a file with these keys, of which one frame has others."""
 
     def load(root):
         make(root, {"": 6}, top=top)
-        file = root / "transforms.json"
-        table = json.loads(file.read_text())
-        table["frames"][number] |= frame
-        dump(file, table)
+        with edited(root / "transforms.json") as table:
+            table["frames"][0] |= frame
         capture = blender_format.read(root)
-        row = capture.ids.index(f"images_r_{number}")
+        row = capture.ids.index("images_r_0")
         focal = capture.cameras.focal_px[row]
         aspect = capture.cameras.pixel_aspect[row]
         center = capture.cameras.principal_point_px[row]
@@ -93,11 +91,9 @@ def test_intrinsics_that_cannot_be_are_refused(case, tmp_path):
 
 def test_a_matrix_by_columns_is_refused(tmp_path):
     make(tmp_path, {"": 6})
-    file = tmp_path / "transforms.json"
-    table = json.loads(file.read_text())
-    for entry in table["frames"]:
-        entry["transform_matrix"] = np.transpose(entry["transform_matrix"]).tolist()
-    dump(file, table)
+    with edited(tmp_path / "transforms.json") as table:
+        for entry in table["frames"]:
+            entry["transform_matrix"] = np.transpose(entry["transform_matrix"]).tolist()
     with pytest.raises(CaptureError, match=r"last row .* transpose it"):
         blender_format.read(tmp_path)
 

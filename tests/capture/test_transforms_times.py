@@ -1,20 +1,18 @@
 """Times of transforms*.json: of some frames, of none, of one split."""
 
-import json
-
 import numpy as np
 import pytest
 
 from nerfies_jax.capture import blender_format
 from nerfies_jax.capture.capture import CaptureError
-from tests.capture.test_blender_format import dump, make
+from tests.capture.broken import edited
+from tests.capture.test_blender_format import make
 
 
 def rewrite(root, change, name="transforms.json"):
-    table = json.loads((root / name).read_text())
-    for row, entry in enumerate(table["frames"]):
-        change(row, entry)
-    dump(root / name, table)
+    with edited(root / name) as table:
+        for row, entry in enumerate(table["frames"]):
+            change(row, entry)
 
 
 def times_by_number(capture):
@@ -81,12 +79,11 @@ def test_frames_without_a_pose_are_refused_or_left_out(lists, tmp_path):
             entry["transform_matrix"] = None
 
     rewrite(tmp_path, forget)
-    table = json.loads((tmp_path / "transforms.json").read_text())
-    del table["frames"][2]["transform_matrix"]
-    if lists:
-        names = [entry["file_path"] for entry in table["frames"]]
-        table |= {"train_filenames": names[:7], "test_filenames": names[7:]}
-    dump(tmp_path / "transforms.json", table)
+    with edited(tmp_path / "transforms.json") as table:
+        del table["frames"][2]["transform_matrix"]
+        if lists:
+            names = [entry["file_path"] for entry in table["frames"]]
+            table |= {"train_filenames": names[:7], "test_filenames": names[7:]}
     with pytest.raises(CaptureError, match=r"2 of 9 frames have no transform_matrix"):
         blender_format.read(tmp_path)
     capture = blender_format.read(tmp_path, missing="skip")
