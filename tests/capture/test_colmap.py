@@ -10,7 +10,7 @@ import pytest
 import scipy.spatial.transform
 
 from nerfies_jax import capture as room
-from nerfies_jax.capture import colmap, decoder, frames, world_points
+from nerfies_jax.capture import colmap, frames, world_points
 from nerfies_jax.capture.borders import without_black_borders
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.colmap_library import library
@@ -21,10 +21,7 @@ PINHOLE = "PINHOLE 24 16 30 33 12.5 7.75"
 WORLD = np.random.default_rng(1).uniform((-1, -1, 5), (1, 1, 7), (40, 3))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_child():
-    with decoder.session():
-        yield
+pytestmark = pytest.mark.usefixtures("one_child")
 
 
 def rotation(row):

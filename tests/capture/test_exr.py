@@ -7,7 +7,6 @@ import OpenEXR
 import pytest
 
 from nerfies_jax.capture import (
-    decoder,
     exr,
     exr_camera,
     formats,
@@ -23,10 +22,7 @@ COLOR = RNG.uniform(0, 50, (5, 7, 3)).astype(np.float32)
 DEPTH = RNG.uniform(1, 1000, (5, 7)).astype(np.float32)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_child():
-    with decoder.session():
-        yield
+pytestmark = pytest.mark.usefixtures("one_child")
 
 
 def test_float_channels_come_back_bit_for_bit(tmp_path):

@@ -11,7 +11,6 @@ import pytest
 import scipy.ndimage
 
 from nerfies_jax.capture import (
-    decoder,
     footage,
     frames,
     images,
@@ -21,12 +20,9 @@ from nerfies_jax.capture import (
     video_decoding,
 )
 from nerfies_jax.capture.capture import CaptureError
+from tests.capture.test_video import encoder
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_child():
-    with decoder.session():
-        yield
+pytestmark = pytest.mark.usefixtures("one_child")
 
 
 def test_the_sharpest_of_each_stretch_is_kept():
@@ -123,15 +119,12 @@ def test_colors_are_made_of_the_frames_that_are_kept_alone(tmp_path, monkeypatch
 def test_frames_stay_in_order_where_times_are_those_of_decoding(tmp_path):
     """H.264 in .avi: B-frames are decoded out of turn, and nothing else is stored."""
     noise = np.random.default_rng(0).integers(0, 40, (32, 48, 3)).astype(np.uint8)
-    with av.open(str(tmp_path / "a.avi"), "w") as container:
-        options = {"bf": "3", "b_strategy": "0"}
-        stream = container.add_stream("h264", rate=10, options=options)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+    options = {"bf": "3", "b_strategy": "0"}
+    with encoder(tmp_path / "a.avi", (48, 32), **options) as (_, put):
         for number in range(12):
             frame = av.VideoFrame.from_ndarray(noise + np.uint8(15 * number), "rgb24")
             frame.pts, frame.time_base = number, Fraction(1, 10)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            put(frame)
     times = [seconds for seconds, _ in video.read_video(tmp_path / "a.avi")]
     assert min(np.diff(times)) < 0
     source_images = footage.from_video(tmp_path / "a.avi", tmp_path / "out", 12)

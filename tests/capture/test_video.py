@@ -1,5 +1,6 @@
 """Video: round trips, odd sizes, times, and broken files."""
 
+import contextlib
 import os
 import struct
 import subprocess
@@ -9,14 +10,20 @@ import av
 import numpy as np
 import pytest
 
-from nerfies_jax.capture import decoder, footage, high_dynamic_range, video
+from nerfies_jax.capture import footage, high_dynamic_range, video
 from nerfies_jax.capture.capture import CaptureError
 
+pytestmark = pytest.mark.usefixtures("one_child")
 
-@pytest.fixture(autouse=True, scope="module")
-def one_child():
-    with decoder.session():
-        yield
+
+@contextlib.contextmanager
+def encoder(path, size, codec="h264", pixels="yuv420p", **options):
+    """Yields a stream of ten frames a second, and a function that writes one to it."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10, options=options)
+        (stream.width, stream.height), stream.pix_fmt = size, pixels
+        yield stream, lambda frame: container.mux(stream.encode(frame))
+        container.mux(stream.encode())
 
 
 def make_frames(count=8, size=(31, 45)):
@@ -70,11 +77,8 @@ def test_the_file_says_which_colors_it_holds(tmp_path):
     video.write_video(tmp_path / "a.mp4", make_frames())
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0].codec_context
-        assert (stream.color_primaries, stream.colorspace, stream.color_range) == (
-            1,
-            1,
-            1,
-        )
+        tags = (stream.color_primaries, stream.colorspace, stream.color_range)
+        assert tags == (1, 1, 1)
         assert stream.pix_fmt == "yuv420p"
 
 
@@ -90,16 +94,12 @@ def test_at_most_so_many_frames_are_read(tmp_path):
 def test_a_phones_rotation_is_carried_out(tmp_path, turn, expected, mark):
     frame = np.zeros((32, 46, 3), np.uint8)
     frame[:8, :8] = 255  # a mark in the top left corner of what is stored
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("h264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 46, 32, "yuv420p"
+    with encoder(tmp_path / "a.mp4", (46, 32)) as (stream, put):
         if not hasattr(stream, "set_display_rotation"):
             pytest.skip("this PyAV cannot write the tag")
         stream.set_display_rotation(turn)  # degrees against the clock
         for _ in range(3):
-            image = av.VideoFrame.from_ndarray(frame, format="rgb24")
-            container.mux(stream.encode(image))
-        container.mux(stream.encode())
+            put(av.VideoFrame.from_ndarray(frame, format="rgb24"))
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     assert decoded.shape[:2] == expected
     assert decoded[mark].min() > 200
@@ -119,17 +119,8 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
     start = data.index(b"tkhd") + 44
     one, shift = 1 << 16, (48 << 16 if across < 0 else 0, 32 << 16 if down < 0 else 0)
     matrix = (across * one, 0, 0, 0, down * one, 0, *shift, 1 << 30)
-    assert struct.unpack_from(">9i", data, start) == (
-        one,
-        0,
-        0,
-        0,
-        one,
-        0,
-        0,
-        0,
-        1 << 30,
-    )
+    upright = (one, 0, 0, 0, one, 0, 0, 0, 1 << 30)
+    assert struct.unpack_from(">9i", data, start) == upright
     struct.pack_into(">9i", data, start, *matrix)
     (tmp_path / "a.mp4").write_bytes(data)
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
@@ -146,29 +137,22 @@ def test_a_mirror_is_no_turn(tmp_path, across, down, expected):
 def test_a_video_without_color_tags_has_those_of_its_size(tmp_path, height, space):
     color = np.array([200, 30, 40])
     image = np.zeros((height, 64, 3), np.uint8) + color.astype(np.uint8)
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("h264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 64, height, "yuv420p"
+    with encoder(tmp_path / "a.mp4", (64, height)) as (_, put):
         for _ in range(2):
             coded = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(
                 format="yuv420p", dst_colorspace=space, dst_color_range="MPEG"
             )
             coded.colorspace = 2  # not told
-            container.mux(stream.encode(coded))
-        container.mux(stream.encode())
+            put(coded)
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     # The other matrix is off by up to 30.
     assert np.abs(decoded[100, 30] - color).max() <= 4
 
 
 def test_of_rows_alone_nothing_behind_the_last_is_decoded(tmp_path):
-    with av.open(str(tmp_path / "a.mov"), "w") as container:
-        stream = container.add_stream("png", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 45, 31, "rgb24"
+    with encoder(tmp_path / "a.mov", (45, 31), "png", "rgb24") as (_, put):
         for image in make_frames(60):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            put(av.VideoFrame.from_ndarray(image, format="rgb24"))
     data = bytearray((tmp_path / "a.mov").read_bytes())
     where = -1
     for _ in range(40):  # 16 threads, at most, decode ahead
@@ -229,9 +213,8 @@ def test_high_dynamic_range_keeps_what_is_no_brighter_than_half_of_white():
 def test_a_video_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
     luma = np.full((32, 48), 64, np.uint16)  # 10 bits: black, and a code of 0.75
     luma[:, 24:] = 64 + 0.75 * 876
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "2"})
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p10le"
+    deep = encoder(tmp_path / "a.mp4", (48, 32), "libx264", "yuv420p10le", crf="2")
+    with deep as (stream, put):
         context = stream.codec_context
         context.color_primaries, context.color_trc = 9, 18  # BT.2020, HLG
         context.colorspace, context.color_range = 9, 1
@@ -241,8 +224,7 @@ def test_a_video_of_high_dynamic_range_is_told_and_tone_mapped(tmp_path):
                 rows = np.frombuffer(memoryview(plane), np.uint16)
                 rows = rows.reshape(plane.height, -1)
                 rows[:, : plane.width] = values
-            container.mux(stream.encode(image))
-        container.mux(stream.encode())
+            put(image)
     _, decoded = next(iter(video.read_video(tmp_path / "a.mp4")))
     code = np.uint16([round(0.75 * 65535)] * 3)
     paper = high_dynamic_range.tone_mapped(code, "HLG")
@@ -376,14 +358,10 @@ def test_a_cover_stored_as_an_ordinary_stream_is_no_video(tmp_path):
 
 def test_pixels_are_made_square(tmp_path):
     path = tmp_path / "a.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("h264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 32, 48, "yuv420p"
+    with encoder(path, (32, 48)) as (stream, put):
         stream.sample_aspect_ratio = 2
         for _ in range(3):
-            frame = av.VideoFrame.from_ndarray(np.zeros((48, 32, 3), np.uint8), "rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            put(av.VideoFrame.from_ndarray(np.zeros((48, 32, 3), np.uint8), "rgb24"))
     assert next(video.read_video(path))[1].shape == (48, 64, 3)
     assert next(video.read_video(path, gray=True))[1].shape == (48, 64)
     assert "pixels of shape 2, made square" in video.notes_of(path, 3, 0.2)
@@ -391,13 +369,10 @@ def test_pixels_are_made_square(tmp_path):
 
 def coded(path, size, **params):
     """Three frames of raw H.264, which begins anew wherever it is cut."""
-    with av.open(str(path), "w", format="h264") as container:
-        options = {"x264-params": ":".join(f"{k}={v}" for k, v in params.items())}
-        stream = container.add_stream("h264", rate=10, options=options)
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+    options = {"x264-params": ":".join(f"{k}={v}" for k, v in params.items())}
+    with encoder(path, size, **options) as (_, put):
         for frame in make_frames(3, size[::-1]):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
-        container.mux(stream.encode())
+            put(av.VideoFrame.from_ndarray(frame, "rgb24"))
     return path.read_bytes()
 
 
