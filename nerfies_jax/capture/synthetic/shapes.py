@@ -4,6 +4,7 @@ Each shape maps its *material* points (which carry the texture) to *body* points
 time, and back. Both maps are exact, and also defined off the surface.
 """
 
+import abc
 import dataclasses
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ class Squash:
     phase: float = 0.0  # in cycles
 
 
-class _Shape:
+class _Shape(abc.ABC):
     """Maps and intersections of a shape. By default its material does not move."""
 
     def bends(self) -> bool:
@@ -53,6 +54,7 @@ class _Shape:
         """Map a body point [3] to the material at a time in [0, 1]."""
         return point
 
+    @abc.abstractmethod
     def cross(self, origin, direction, time) -> Crossing:
         """Find the first intersection of a ray.
 
@@ -64,7 +66,6 @@ class _Shape:
         Returns:
           The first intersection.
         """
-        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
