@@ -294,7 +294,7 @@ def sort_pairs(
     """Sort pairs, given in depth order, by tile.
 
     One unsigned sort of (tile, rank relative to the chunk) is used if both fit into 32
-    bits. A sort with a payload takes ten times as long on a CPU.
+    bits. A sort with a payload takes five to seven times as long on a CPU.
 
     Args:
       tile: Tile of each slot. `grid.tiles` marks an unused slot.

@@ -175,7 +175,7 @@ def begun(params):
 
 
 def test_zero_slopes_do_not_freeze_what_has_momentum():
-    """The trap: this is why `hold` exists."""
+    """Momentum moves parameters without gradients, so freezing restores them."""
     trained = begun(rows_and_nets(COUNT))
     drifted = adam_step(trained, jax.tree.map(np.zeros_like, trained.params))
     for a, b in zip(*map(jax.tree.leaves, (trained, drifted)), strict=True):

@@ -113,7 +113,7 @@ def network(spec: WarpSpec) -> MLPSpec:
 
 
 def init(spec: WarpSpec, key: Key[Array, ""], dtype: DTypeLike = jnp.float32) -> MLP:
-    """Initialize near the identity. In a box of side two, shifts are at most 2e-4.
+    """Initialize near the identity. In a box of side two, shifts are below 1.2e-4.
 
     Weights of an annealed band start at zero. They have no gradient until the band
     opens, and random weights would then deform a trained warp.
