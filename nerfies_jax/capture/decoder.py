@@ -89,13 +89,7 @@ class Decoder:
         memory_bytes: int = 0,
         **arguments: Any,
     ) -> Generator[Answer, None, None]:
-        """Run an operation with any number of answers.
-
-        Args:
-          operation: As for `request`.
-          cpu_seconds: As for `request`.
-          memory_bytes: As for `request`.
-          **arguments: As for `request`.
+        """Run an operation with any number of answers, with arguments as for `request`.
 
         Yields:
           The answers as they arrive. The time limit holds for each answer.
@@ -119,11 +113,9 @@ class Decoder:
                 ) is not None:
                     yield answer
                 complete = True
-            except _ReportedError as error:
+            except DecoderError:  # reported by the child
                 complete = True
-                failure = DecoderError(str(error))
-                failure.has_advice = error.has_advice
-                raise failure from None
+                raise
             except (OSError, ValueError, EOFError, KeyError, TypeError) as error:
                 reason = self._ending(error)
                 # A signal to the process group ended the child as well.
@@ -168,14 +160,6 @@ class Decoder:
         child.wait()
 
 
-class _ReportedError(Exception):
-    """An error message of the child."""
-
-    def __init__(self, message, has_advice):
-        super().__init__(message)
-        self.has_advice = has_advice
-
-
 def _next_answer(child, seconds):
     """Return the next answer of the child, None after the last one of a request."""
     timer = threading.Timer(seconds, child.kill)
@@ -189,7 +173,9 @@ def _next_answer(child, seconds):
         if head.get("end"):
             return None
         if "error" in head:
-            raise _ReportedError(str(head["error"]), bool(head["has_advice"]))
+            failure = DecoderError(str(head["error"]))
+            failure.has_advice = bool(head["has_advice"])
+            raise failure
         arrays, total = {}, 0
         for name, kind, shape in head["arrays"]:
             dtype = np.dtype(str(kind))

@@ -64,14 +64,7 @@ def kind_of(path: pathlib.Path) -> str | None:
 
 
 def images_in(folder: pathlib.Path) -> list[pathlib.Path]:
-    """List the image files of a folder, by their suffix.
-
-    Args:
-      folder: The folder.
-
-    Returns:
-      Paths in natural order.
-    """
+    """List the image files of a folder, by their suffix, in natural order."""
     files = frames.images_in(folder, (*PLAIN, *HEIC))
     return sorted(files, key=lambda file: frames.natural(file.name))
 
@@ -133,10 +126,9 @@ def from_video(
             names.append(f"ms{round(times[row] * 1000):08d}.png")
             _write(out / "images" / names[-1], shrink(frame, factor))
             if sources is not None:
-                source = sources[row]
-                mask = mask_files.read_mask(source, encoding, "upright")
+                mask = mask_files.read_mask(sources[row], encoding, "upright")
                 white.append(mask.mean())
-                _write_mask(out, names[-1], mask, frame.shape, factor, source)
+                _write_mask(out, names[-1], mask, frame.shape, factor, sources[row])
             stage.advance()
     notes = [
         f"{len(selection)} of {len(scores)} frames selected, {blur_count} too blurred"

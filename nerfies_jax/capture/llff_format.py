@@ -132,14 +132,7 @@ def order_note(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def placed(poses: Poses) -> Placement:
-    """Normalize the scene by points on each viewing axis at the depth bounds.
-
-    Args:
-      poses: The cameras.
-
-    Returns:
-      The placement.
-    """
+    """Normalize the scene by points on each viewing axis at the depth bounds."""
     offset = poses.rotations[:, None, 2] * poses.bounds[..., None]
     points = (poses.positions[:, None] + offset).reshape(-1, 3)
     return place_by_points(points, poses.positions, poses.bounds.ravel())

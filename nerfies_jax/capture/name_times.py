@@ -83,14 +83,7 @@ def clock(names: Sequence[str]) -> Clock:
 
 
 def order(names: Sequence[str]) -> list[int]:
-    """Return the position of each name in natural order.
-
-    Args:
-      names: Names of the frames.
-
-    Returns:
-      Positions, [frames].
-    """
+    """Return the position of each name in natural order."""
     rows = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
     return np.argsort(rows).tolist()
 

@@ -122,10 +122,7 @@ def _undistort(capture, wide):
         for name, array in (("moving", capture.moving), ("depths", capture.depths))
     }
 
-    def places(camera, size):
-        return _source_pixels(camera, size, wide)
-
-    maps = Maps(places, capture.size)
+    maps = _source_maps(capture, wide)
     with events.stage("undistorting images", len(images)) as stage:
         for row in range(len(images)):
             place, inside = maps.of(cameras.take(capture.cameras, row))
@@ -144,11 +141,14 @@ def _undistort(capture, wide):
 
 def _undistort_external(capture, external, wide):
     camera_of = [cameras.take(capture.cameras, row) for row in range(len(capture.ids))]
-    maps = Maps(lambda camera, size: _source_pixels(camera, size, wide), capture.size)
+    maps = _source_maps(capture, wide)
     order = np.argsort(capture.times[capture.train], kind="stable")
 
     def straight(row, pixel):
-        return _straight_points(camera_of[row], pixel, wide)
+        camera = camera_of[row]
+        slopes, exists = _straight(_float32(camera), _slopes_at(camera, pixel))
+        positions = _pixels_at(camera, np.asarray(slopes))
+        return positions + np.array([wide.left, wide.top]), np.asarray(exists)
 
     return external_lens.undistorted(
         external,
@@ -157,15 +157,6 @@ def _undistort_external(capture, external, wide):
         lambda row: maps.of(camera_of[row]),
         straight,
     )
-
-
-def _straight_points(
-    camera: Camera, pixel: np.ndarray, wide: Canvas
-) -> tuple[np.ndarray, np.ndarray]:
-    """Undistort positions in a captured image."""
-    slopes, exists = _straight(_float32(camera), _slopes_at(camera, pixel))
-    straight = _pixels_at(camera, np.asarray(slopes))
-    return straight + np.array([wide.left, wide.top]), np.asarray(exists)
 
 
 def canvas(capture: Capture) -> Canvas:
@@ -275,14 +266,7 @@ def has_lens(camera: Camera) -> bool:
 
 
 def pinhole(camera: Camera) -> Camera:
-    """Remove the distortion coefficients of cameras.
-
-    Args:
-      camera: A camera or a batch.
-
-    Returns:
-      The cameras without distortion.
-    """
+    """Remove the distortion coefficients of a camera or of a batch."""
     return camera._replace(
         radial=0 * camera.radial, tangential=0 * camera.tangential, fisheye=None
     )
@@ -312,6 +296,10 @@ class Maps:
         if key not in self._kept:
             self._kept[key] = self._places(camera, self._size)
         return self._kept[key]
+
+
+def _source_maps(capture, wide):
+    return Maps(lambda camera, size: _source_pixels(camera, size, wide), capture.size)
 
 
 def _straight_pixels(camera, size):

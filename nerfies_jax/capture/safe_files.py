@@ -63,14 +63,7 @@ def confines(
 
 
 def carried(function: Callable[..., Content]) -> Callable[..., Content]:
-    """Wrap a function so that the caller's `confined` folder holds in other threads.
-
-    Args:
-      function: The function.
-
-    Returns:
-      The confined function.
-    """
+    """Wrap a function so that the caller's folder confines it in other threads too."""
     folder = _folder.get()
 
     def run(*args: Any) -> Content:

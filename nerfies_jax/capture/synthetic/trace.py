@@ -164,7 +164,8 @@ def shade(
     """
     dtype = direction.dtype
     toward_light = jnp.asarray(motion.unit_axis(spec.light), dtype)
-    base = _surface_color(spec, jnp.maximum(hit.thing, 0), hit.material)
+    textures = [body.texture for body in spec.all_things()]
+    base = texture.albedo(textures, jnp.maximum(hit.thing, 0), hit.material)
     lambert = jnp.maximum(jnp.sum(hit.normal * toward_light), 0)
     # Ambient light is stronger from above, which gives shaded surfaces some shading.
     sky = 0.75 + 0.25 * hit.normal[1]
@@ -177,14 +178,6 @@ def shade(
         color = color + jnp.where(is_specular, spec.specular.strength * lobe, 0)
     background = jnp.asarray(linear_from_srgb(np.asarray(spec.background)), dtype)
     return light_gain * jnp.where(hit.thing == NOTHING, background, color)
-
-
-def _surface_color(
-    spec: SceneSpec, thing: Int[Array, ""], material: Float[Array, "3"]
-) -> Float[Array, "3"]:
-    """Evaluate the linear albedo of a material point."""
-    textures = [body.texture for body in spec.all_things()]
-    return texture.albedo(textures, thing, material)
 
 
 def visible(
