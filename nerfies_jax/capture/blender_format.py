@@ -16,7 +16,7 @@ from nerfies_jax.capture import (
     world_points,
 )
 from nerfies_jax.capture import images as image_files
-from nerfies_jax.capture.capture import Capture, CaptureError
+from nerfies_jax.capture.capture import Capture, CaptureError, check_times
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file
 from nerfies_jax.capture.points import (
     Placement,
@@ -269,13 +269,7 @@ def _times(entries, split):
     count = len(entries)
     if all(time is not None for time in entry_times):
         times = np.array(entry_times, np.float32)
-        bad = ~((times >= 0) & (times <= 1))
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise CaptureError(
-                f"{split.file}: frame {entries[row].file_path!r} has time "
-                f"{times[row]:g}; times run from 0 to 1, so divide by the last one"
-            )
+        check_times(times, [entry.file_path for entry in entries], str(split.file))
         return times, None, ()
     if split.file.name == "transforms_train.json":
         note = "no times: taken as a static scene"

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -208,15 +209,19 @@ def check_cameras(
         raise CaptureError(str(error)) from None
 
 
-def _check_numbers(capture, where):
-    times = capture.times
+def check_times(times: np.ndarray, names: Sequence[str], where: str):
+    """Refuse times [frames] outside of [0, 1], with the name of the frame."""
     bad = ~((times >= 0) & (times <= 1))  # also true for NaN
     if bad.any():
         row = int(np.argmax(bad))
         raise CaptureError(
-            f"{where}: frame {capture.ids[row]!r} has time {times[row]:g}; times run "
-            "from 0 to 1 over the capture, so divide by the last one"
+            f"{where}: frame {names[row]!r} has time {times[row]:g}; times run from 0 "
+            "to 1 over the capture, so divide by the last one"
         )
+
+
+def _check_numbers(capture, where):
+    check_times(capture.times, capture.ids, where)
     if not 0 < capture.near < capture.far < np.inf:
         raise CaptureError(
             f"{where}: near = {capture.near:g} and far = {capture.far:g}; "

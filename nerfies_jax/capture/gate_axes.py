@@ -86,7 +86,12 @@ def _other_conventions(capture, rotation, position):
             ),
             "the poses are the inverse": (back, inverse),
         }
-    matrix = back @ _FLIP  # as in the file
+    return transforms_conventions(rotation, position)
+
+
+def transforms_conventions(rotation: np.ndarray, position: np.ndarray) -> dict:
+    """Interpret poses of transforms.json under other conventions, by their names."""
+    matrix = rotation.swapaxes(1, 2) @ _FLIP  # as in the file
     inverse = -np.einsum("nij,nj->ni", matrix.swapaxes(1, 2), position)
     return {
         "transform_matrix is camera to world with axes right, down, forward (OpenCV)": (

@@ -135,26 +135,15 @@ def _other_conventions(capture, cameras, pose):
     def rotate(matrix, vector):
         return np.einsum("nij,nj->ni", matrix, vector)
 
-    opencv = "axes right, down, forward (OpenCV)"
     remedy = "; convert the poses to camera to world with axes right, up, back (OpenGL)"
     readings = {}
     if capture.source == "blender":
-        matrix = back @ _FLIP  # as it stands in the file
-        inverse = -rotate(matrix.swapaxes(1, 2), position)
-        readings |= {
-            f"transform_matrix is camera to world with {opencv}{remedy}": Pose(
-                _FLIP @ rotation, position
-            ),
-            f"transform_matrix is world to camera with {opencv}{remedy}": Pose(
-                matrix, inverse
-            ),
-            "transform_matrix is world to camera with axes right, up, back (OpenGL)"
-            + remedy: Pose(_FLIP @ matrix, inverse),
-        }
+        for name, other in gate_axes.transforms_conventions(rotation, position).items():
+            readings[f"{name}{remedy}"] = Pose(*other)
     else:
         remedy = (
-            "; convert the poses to rotations from world to camera with "
-            f"{opencv}, and positions of the cameras"
+            "; convert the poses to rotations from world to camera with axes right, "
+            "down, forward (OpenCV), and positions of the cameras"
         )
         readings |= {
             f"the camera's axes are right, up, back (OpenGL){remedy}": Pose(

@@ -197,6 +197,18 @@ def read_poses(path: pathlib.Path) -> Poses:
     )
 
 
+def reduction_of(file: pathlib.Path, size: tuple[int, int], poses: Poses) -> int:
+    """Return the integer reduction of a stored image, and refuse any other size."""
+    ratio = max(1, round(poses.size[0] / size[0]))
+    if np.abs(np.array(poses.size) / ratio - size).max() > 1:
+        raise CaptureError(
+            f"{file}: {size[0]}x{size[1]} pixels, but {POSES} is for "
+            f"{poses.size[0]}x{poses.size[1]}; images must be an integer fraction of "
+            "that"
+        )
+    return ratio
+
+
 def _folders(path, poses):
     """Folders by reduction, with as many images as there are poses."""
     available = {}
@@ -210,15 +222,7 @@ def _folders(path, poses):
                 f"{POSES}; they are matched in the order of the names, so restore "
                 "missing files or remove extra ones"
             )
-        width, height = image_files.read_header(files[0]).size
-        ratio = max(1, round(poses.size[0] / width))
-        difference = abs(np.array(poses.size) / ratio - (width, height))
-        if difference.max() > 1:
-            raise CaptureError(
-                f"{files[0]}: {width}x{height} pixels, but {POSES} is for "
-                f"{poses.size[0]}x{poses.size[1]}; images must be an integer fraction "
-                "of that"
-            )
+        ratio = reduction_of(files[0], image_files.read_header(files[0]).size, poses)
         available.setdefault(ratio, folder)
     if not available:
         raise CaptureError(

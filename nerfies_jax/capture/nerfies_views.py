@@ -13,6 +13,7 @@ from nerfies_jax.capture.capture import (
     Capture,
     CaptureError,
     check_cameras,
+    check_times,
 )
 from nerfies_jax.capture.json_files import AnyPath, inside, named_file, read_json
 from nerfies_jax.capture.nearest import known_names
@@ -434,13 +435,7 @@ def _with_warp_ids(entries, values):
 def _times(entries, path, ids):
     if all(entry.time is not None for entry in entries):
         times = np.array([entry.time for entry in entries], np.float32)
-        bad = ~((times >= 0) & (times <= 1))
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise CaptureError(
-                f"{path / 'metadata.json'}: frame {ids[row]!r} has time "
-                f"{times[row]:g}; expected 0 to 1"
-            )
+        check_times(times, ids, str(path / "metadata.json"))
         return times
     if all(entry.time_id is not None for entry in entries):
         return splits.spread([entry.time_id for entry in entries])

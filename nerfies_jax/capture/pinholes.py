@@ -78,10 +78,8 @@ class _Last:
     def _forget(self, _=None):
         self._images: Any = lambda: None
         self._others, self._arrays = (), None
-        self._external: tuple[Any, Any] = (
-            None,
-            None,
-        )  # external results, and undistorted
+        # External results, and undistorted.
+        self._external: tuple[Any, Any] = (None, None)
 
     def arrays(self, capture):
         others = _others(capture)

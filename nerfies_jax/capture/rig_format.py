@@ -122,13 +122,7 @@ def _sources(path, poses):
                 "them, in the order of their names, so restore or remove some"
             )
         size = _size_of(sources[0])
-        ratio = max(1, round(poses.size[0] / size[0]))
-        if np.abs(np.array(poses.size) / ratio - size).max() > 1:
-            raise CaptureError(
-                f"{sources[0]}: {size[0]}x{size[1]} pixels, but {llff_format.POSES} is "
-                f"for {poses.size[0]}x{poses.size[1]}; frames must be an integer "
-                "fraction of that"
-            )
+        ratio = llff_format.reduction_of(sources[0], size, poses)
         available.setdefault(ratio, sources)
     return available
 

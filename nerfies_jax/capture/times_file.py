@@ -70,9 +70,8 @@ def with_times(capture: Capture, path: AnyPath) -> Capture:
         times=splits.spread(clock),
         warp_ids=splits.dense(clock),
         camera_ids=camera_ids,
-        flow=None
-        if is_regrouped
-        else capture.flow,  # flow is between frames of one camera
+        # Flow is between frames of one camera.
+        flow=None if is_regrouped else capture.flow,
         notes=(*capture.notes, note, *notes, *camera_notes),
     )
 

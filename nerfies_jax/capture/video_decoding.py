@@ -31,16 +31,15 @@ def frames(
     Raises:
       FileError: If the video cannot be used, with the remedy but without the path.
     """
-    av = extras.library("av", "video")
     last = math.inf if rows is None else max(rows, default=-1)
     requested_rows = None if rows is None else set(rows)
     count, size = 0, None
-    with _words_of(av), av.open(path) as container:
+    with _opened(path) as container:
         stream = _main_stream(container)
         _check_size(stream.width, stream.height)
         stream.thread_type = "AUTO"
         aspect = stream.sample_aspect_ratio
-        for number, frame in enumerate(_decode(av, container, stream, damaged)):
+        for number, frame in enumerate(_decode(container, stream, damaged)):
             size = size or (frame.width, frame.height)
             if (frame.width, frame.height) != size:
                 raise FileError(
@@ -70,8 +69,7 @@ def frames(
 
 def transfer(path: str) -> Iterator[Reply]:
     """Find the transfer function of an HDR video, None for other videos."""
-    av = extras.library("av", "video")
-    with _words_of(av), av.open(path) as container:
+    with _opened(path) as container:
         frame = next(container.decode(_main_stream(container)), None)
         name = None if frame is None else TRANSFERS.get(int(frame.color_trc))
         yield {"transfer": name}, {}
@@ -79,8 +77,7 @@ def transfer(path: str) -> Iterator[Reply]:
 
 def length(path: str) -> Iterator[Reply]:
     """Read the number of frames of a video from its header."""
-    av = extras.library("av", "video")
-    with _words_of(av), av.open(path) as container:
+    with _opened(path) as container:
         stream = _main_stream(container)
         seconds = (container.duration or 0) / 1e6
         count = stream.frames or round(seconds * float(stream.average_rate or 0))
@@ -89,16 +86,17 @@ def length(path: str) -> Iterator[Reply]:
 
 def notes(path: str, count: int, last: float) -> Iterator[Reply]:
     """Describe anything unusual about a video, for `video.notes_of`."""
-    av = extras.library("av", "video")
-    with _words_of(av), av.open(path) as container:
+    with _opened(path) as container:
         yield {"notes": _notes(container, count, last)}, {}
 
 
 @contextlib.contextmanager
-def _words_of(av):
-    """Reduce FFmpeg's errors to their messages."""
+def _opened(path):
+    """Open a video, with FFmpeg's errors reduced to their messages."""
+    av = extras.library("av", "video")
     try:
-        yield
+        with av.open(path) as container:
+            yield container
     except (av.FFmpegError, OSError) as error:
         raise ValueError(str(error.strerror or error)) from None
 
@@ -173,8 +171,9 @@ def _shortfall(container, stream, count, last):
     )
 
 
-def _decode(av, container, stream, on_damage):
+def _decode(container, stream, on_damage):
     """Decode frames. Unless damage is refused, skip those that cannot be decoded."""
+    damage = extras.library("av", "video").FFmpegError
     if on_damage == "refuse":
         yield from container.decode(stream)
         return
@@ -184,11 +183,11 @@ def _decode(av, container, stream, on_damage):
             packet = next(packets, None)
             if packet is None:
                 return
-        except av.FFmpegError:  # the file ends here; flush the decoder
-            with contextlib.suppress(av.FFmpegError):
+        except damage:  # the file ends here; flush the decoder
+            with contextlib.suppress(damage):
                 yield from stream.codec_context.decode(None)
             return
-        with contextlib.suppress(av.FFmpegError):
+        with contextlib.suppress(damage):
             yield from packet.decode()
 
 
