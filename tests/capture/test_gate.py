@@ -1,7 +1,6 @@
 """Captures that can be read and cannot be right: units of depth, nothing observed."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from nerfies_jax.capture import formats, gate, images, nerfies_format
 from nerfies_jax.capture.capture import CaptureError
 from nerfies_jax.capture.external import ExternalResults
+from tests.capture.test_blender_format import make
 from tests.scenes import tiny_capture
 
 
@@ -93,32 +93,15 @@ def test_masks_named_as_no_frame_are_said(tmp_path):
     [(0, "are transparent"), (1, "at most 1 of 255, so no pixel is")],
 )
 def test_images_that_are_transparent_everywhere_are_refused(alpha, words, tmp_path):
-    table = {"fl_x": 9.0, "frames": []}
-    for row in range(3):
-        images.write_png(tmp_path / f"{row}.png", np.full((6, 8, 4), alpha, np.uint8))
-        pose = np.eye(4).tolist()
-        table["frames"].append({"file_path": f"{row}.png", "transform_matrix": pose})
-    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    make(tmp_path, {"": 3})
+    for file in (tmp_path / "images").iterdir():
+        images.write_png(file, np.full((8, 10, 4), alpha, np.uint8))
     with pytest.raises(CaptureError, match=words):
         formats.load(tmp_path)
 
 
 def test_depths_of_transforms_are_said_not_to_be_read(tmp_path):
-    pixels = np.full((6, 8, 3), 90, np.uint8)
-    entries = []
-    for row in range(3):
-        pose = np.eye(4)
-        pose[0, 3] = row
-        images.write_png(tmp_path / f"{row}.png", pixels)
-        entries.append(
-            {
-                "file_path": f"{row}.png",
-                "depth_file_path": f"depth/{row}.png",
-                "transform_matrix": pose.tolist(),
-            }
-        )
-    table = {"fl_x": 9.0, "w": 8, "h": 6, "frames": entries}
-    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    make(tmp_path, {"": 3}, depth_file_path="depth/0.png")
     notes = " ".join(formats.load(tmp_path).notes)
     assert "depth_file_path of 3 frames is not read; the depth maps in depth" in notes
 

@@ -74,14 +74,7 @@ def test_everything_in_the_files_arrives(tmp_path):
         np.testing.assert_array_equal(capture.images[row], image(row))
     assert capture.train.tolist() == [0, 2, 4]
     assert capture.heldout.tolist() == [1, 3, 5]
-    assert capture.warp_ids.tolist() == [
-        0,
-        1,
-        2,
-        3,
-        4,
-        5,
-    ]  # re-indexed from 10, 12, ...
+    assert capture.warp_ids.tolist() == [*range(6)]  # re-indexed from 10, 12, ...
     assert capture.camera_ids.tolist() == [0, 1, 0, 1, 0, 1]
     np.testing.assert_allclose(capture.times, [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-7)
     cameras = capture.cameras
@@ -150,7 +143,8 @@ def test_ids_written_as_numbers_are_names(tmp_path):
         ({"ids": 16, "val_ids": []}, None, 14, [4, 12]),
         ({"val_ids": [3, 5], "ids": 16}, None, 14, [3, 5]),
         ({"ids": 16, "train_ids": [0, 1, 2], "val_ids": [15]}, None, 3, [3]),
-        ({"ids": 16}, "interp", 4, None),
+        # HyperNeRF: every fourth is learned from, those half-way are scored.
+        ({"ids": 16}, "interp", 4, [1, 3, 5, 7]),
         (None, None, 14, [4, 12]),
     ],
 )
@@ -166,21 +160,9 @@ def test_splits(tmp_path, dataset, heldout, train, scored):
         dump(tmp_path / "dataset.json", names)
     capture = nerfies_format.read(tmp_path, heldout=heldout)
     assert capture.train.size == train
-    if scored is not None:
-        assert capture.heldout.tolist() == scored
-    else:  # HyperNeRF: every fourth is learned from, those half-way are scored
-        assert [capture.ids[row] for row in capture.train] == [
-            "000",
-            "004",
-            "008",
-            "012",
-        ]
-        assert [capture.ids[row] for row in capture.heldout] == [
-            "002",
-            "006",
-            "010",
-            "014",
-        ]
+    assert capture.heldout.tolist() == scored
+    if heldout == "interp":
+        assert capture.ids == tuple(f"{row:03d}" for row in range(0, 16, 2))
 
 
 def test_dycheck_splits_come_in_pairs(tmp_path):
@@ -268,9 +250,8 @@ def test_points_are_scaled_and_colored_from_the_images(tmp_path):
         capture.points.position, [[0, 0, 1], [0, 0, -6]], atol=1e-7
     )
     assert capture.points.color[0, 0] in range(40, 46)
-    assert (
-        capture.points.color[1].tolist() == [world_points.UNSEEN] * 3
-    )  # behind every camera
+    # Behind every camera.
+    assert capture.points.color[1].tolist() == [world_points.UNSEEN] * 3
     assert any("1 points are not finite" in note for note in capture.notes)
 
 

@@ -256,7 +256,6 @@ def test_srgb_undoes_linear_and_has_a_slope_at_black(float64):
     coded = np.linspace(0, 1, 101)
     back = jax.jit(texture.srgb)(np.asarray(images.linear_from_srgb(coded)))
     assert np.abs(back - coded).max() < 1e-7
-    assert (
-        abs(float(images.linear_from_srgb(0.5)) - 0.21404114) < 1e-8
-    )  # tables of IEC 61966-2-1
+    # Tables of IEC 61966-2-1.
+    assert abs(float(images.linear_from_srgb(0.5)) - 0.21404114) < 1e-8
     assert float(jax.jit(jax.grad(texture.srgb))(0.0)) == 12.92
