@@ -79,13 +79,7 @@ def _camera(spec, setting, rng):
     distance = ratio * setting.object_size
     azimuth = rng.uniform(-setting.arc_rad, setting.arc_rad)
     elevation = rng.uniform(*setting.elevation_rad)
-    back = np.array(
-        [
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-            np.cos(azimuth) * np.cos(elevation),
-        ]
-    )
+    back = backward(azimuth, elevation)
     target = np.asarray(setting.target)
     aim = target + setting.object_size * rng.uniform(-0.15, 0.15, 3)
     # The object fills this share of the width, as far as lenses allow.
@@ -93,6 +87,13 @@ def _camera(spec, setting, rng):
     focal_px = spec.size[0] * np.clip(fill * ratio, *setting.focal_widths)
     up = np.array([0.0, 1.0, 0.0])
     return cameras.look_at(target + distance * back, aim, up, focal_px, spec.size)
+
+
+def backward(azimuth, elevation) -> np.ndarray:
+    """Return the direction [..., 3] to cameras from their target, for angles in rad."""
+    x = np.sin(azimuth) * np.cos(elevation)
+    z = np.cos(azimuth) * np.cos(elevation)
+    return np.stack([x, np.sin(elevation), z], axis=-1)
 
 
 def _appearances(setting, count, rng):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nerfies_jax.capture.synthetic import collection, snapshots, texture, trace
+from nerfies_jax.capture.synthetic import collection, texture, trace
 from nerfies_jax.capture.synthetic.collection import Photo
 from nerfies_jax.capture.synthetic.spec import SceneSpec
 from nerfies_jax.geometry import camera as cameras
@@ -113,9 +113,35 @@ def _snapshot_schedule(spec, seed):
         camera_id=np.zeros(spec.frames, np.int32),
         time=times.astype(np.float32),
         learn=indices % spec.heldout_every != 0,
-        cameras=_through_lens(spec, snapshots.views(spec, seed)),
+        cameras=_through_lens(spec, _snapshot_views(spec, seed)),
         light_gain=_light_gain(spec, times, seed),
         transient_shown=np.zeros(spec.frames, bool),
+    )
+
+
+def _snapshot_views(spec, seed):
+    """Cameras in the cells of a grid over azimuth and elevation, in random order."""
+    setting = spec.snapshots
+    rng = np.random.default_rng([seed, 8])
+    grid = (setting.columns, setting.rows)
+    cell = np.indices(grid).reshape(2, -1).T
+    place = (cell + rng.uniform(size=cell.shape)) / grid
+    azimuth = setting.arc_rad * (2 * place[:, 0] - 1)
+    low, high = setting.elevation_rad
+    elevation = low + (high - low) * place[:, 1]
+    distance = rng.uniform(*setting.distance, len(cell))
+    back = collection.backward(azimuth, elevation)
+    target = np.asarray(setting.target)
+    aim = target + setting.aim * rng.uniform(-1, 1, back.shape)
+    position = target + distance[:, None] * back
+    order = rng.permutation(len(cell))
+    focal_px = spec.size[0] / 2 / np.tan(setting.field_of_view_rad / 2)
+    up = np.array([0.0, 1.0, 0.0])
+    return cameras.stack(
+        [
+            cameras.look_at(position[row], aim[row], up, focal_px, spec.size)
+            for row in order
+        ]
     )
 
 
