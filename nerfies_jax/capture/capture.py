@@ -210,7 +210,16 @@ def check_cameras(
 
 
 def check_times(times: np.ndarray, names: Sequence[str], where: str):
-    """Refuse times [frames] outside of [0, 1], with the name of the frame."""
+    """Check that times lie in [0, 1].
+
+    Args:
+      times: Times, [frames].
+      names: Names of the frames.
+      where: The file, for the message.
+
+    Raises:
+      CaptureError: If a time lies outside or is not a number.
+    """
     bad = ~((times >= 0) & (times <= 1))  # also true for NaN
     if bad.any():
         row = int(np.argmax(bad))

@@ -89,7 +89,13 @@ class Decoder:
         memory_bytes: int = 0,
         **arguments: Any,
     ) -> Generator[Answer, None, None]:
-        """Run an operation with any number of answers, with arguments as for `request`.
+        """Run an operation with any number of answers.
+
+        Args:
+          operation: As for `request`.
+          cpu_seconds: As for `request`.
+          memory_bytes: As for `request`.
+          **arguments: As for `request`.
 
         Yields:
           The answers as they arrive. The time limit holds for each answer.

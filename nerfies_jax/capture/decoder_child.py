@@ -68,7 +68,8 @@ def _photograph(photographs, path, header_only):
         yield {"refused": type(error).__name__, "message": str(error)}, {}
 
 
-# The module that decodes, and a function of it and the arguments, or its own function.
+# The module that decodes, and the name of its function, or a function above that takes
+# the module and the arguments.
 OPERATIONS: dict[str, tuple[str, Callable[..., Iterable] | str]] = {
     "colmap": ("colmap_tables", _table),
     "exr": ("exr_decoding", _table),

@@ -11,6 +11,10 @@ class CaptureError(FileError):
 
 # Errors of code that reads parsed JSON whose keys, types or values are unexpected.
 UNEXPECTED_CONTENT = (
-    *(LookupError, TypeError, AttributeError, ValueError, ArithmeticError),
+    LookupError,
+    TypeError,
+    AttributeError,
+    ValueError,
+    ArithmeticError,
     RecursionError,
 )

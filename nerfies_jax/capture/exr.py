@@ -119,7 +119,17 @@ def in_display_window(path: AnyPath, image: ExrImage) -> ExrImage:
 
 
 def existing(path: AnyPath) -> pathlib.Path:
-    """Check that an image exists and may be read."""
+    """Check that an image exists and may be read.
+
+    Args:
+      path: The image.
+
+    Returns:
+      The same path.
+
+    Raises:
+      CaptureError: If it is missing or leads outside of the capture.
+    """
     path = pathlib.Path(path)
     if not path.is_file():
         raise CaptureError(f"{path}: no such image; restore it or drop its frame")

@@ -64,7 +64,14 @@ def kind_of(path: pathlib.Path) -> str | None:
 
 
 def images_in(folder: pathlib.Path) -> list[pathlib.Path]:
-    """List the image files of a folder, by their suffix, in natural order."""
+    """List the image files of a folder, by their suffix.
+
+    Args:
+      folder: The folder.
+
+    Returns:
+      Paths in natural order.
+    """
     files = frames.images_in(folder, (*PLAIN, *HEIC))
     return sorted(files, key=lambda file: frames.natural(file.name))
 

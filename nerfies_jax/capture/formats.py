@@ -73,7 +73,14 @@ def _is_llff(path):
 
 
 def videos_in(path: pathlib.Path) -> list[pathlib.Path]:
-    """List the videos of a folder, by their suffix, in lexicographic order."""
+    """List the videos of a folder by their suffix.
+
+    Args:
+      path: The folder.
+
+    Returns:
+      Paths in lexicographic order.
+    """
     files = path.glob("*") if path.is_dir() else ()
     return sorted(
         file

@@ -201,6 +201,13 @@ def frame_bytes(capture: Capture, devices: int = 1) -> int:
 
 
 def capture_bytes(capture: Capture) -> int:
-    """Count the bytes of images, masks and depths of a capture on the host."""
+    """Return the memory of the images, masks and depths of a capture on the host.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      Bytes.
+    """
     arrays = (capture.images, capture.valid, capture.moving, capture.depths)
     return sum(array.nbytes for array in arrays if array is not None)

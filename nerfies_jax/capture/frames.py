@@ -30,7 +30,14 @@ _ENDINGS = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
 
 
 def natural(name: str) -> tuple:
-    """Return a sort key under which frame 9 comes before frame 10."""
+    """Return a sort key under which frame 9 comes before frame 10.
+
+    Args:
+      name: Name of the frame.
+
+    Returns:
+      The key.
+    """
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts)
 

@@ -27,7 +27,14 @@ class Look(NamedTuple):
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check if the cameras look at one point, or would under another convention."""
+    """Check if the cameras look at one point, or would under another convention.
+
+    Args:
+      capture: The capture, without points.
+
+    Returns:
+      The findings.
+    """
     rotation = np.asarray(capture.cameras.camera_from_world, np.float64)
     position = np.asarray(capture.cameras.position, np.float64) / capture.scale
     position = position + np.array(capture.center)
@@ -90,7 +97,15 @@ def _other_conventions(capture, rotation, position):
 
 
 def transforms_conventions(rotation: np.ndarray, position: np.ndarray) -> dict:
-    """Interpret poses of transforms.json under other conventions, by their names."""
+    """Interpret poses of transforms.json under other conventions.
+
+    Args:
+      rotation: Rotations from world to camera, as they were read, [frames, 3, 3].
+      position: Positions of the cameras, as they were read, [frames, 3].
+
+    Returns:
+      Rotations and positions under each convention, by its description.
+    """
     matrix = rotation.swapaxes(1, 2) @ _FLIP  # as in the file
     inverse = -np.einsum("nij,nj->ni", matrix.swapaxes(1, 2), position)
     return {

@@ -26,7 +26,14 @@ MOST_ROUNDED = 10_000  # points that are tested for rounding
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check intrinsics and the precision of positions."""
+    """Check intrinsics and the precision of positions.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [
         _field_of_view(capture),
         _aspect(capture),

@@ -23,7 +23,14 @@ SAMPLES = 1_000_000  # pixels, enough for an accurate median
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check the units of depths, and find unread folders of masks or depths."""
+    """Check the units of depths, and find folders of masks or depths that are not read.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [*_depths(capture), *_unread(capture)]
 
 

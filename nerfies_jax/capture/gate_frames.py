@@ -22,7 +22,14 @@ _MASKS = (
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Check brightness, shares of observed and moving pixels, and times."""
+    """Check brightness, shares of observed and moving pixels, and times.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings.
+    """
     return [
         _brightness(capture),
         *_find_unobserved(capture),

@@ -49,7 +49,14 @@ class Projected(NamedTuple):
 
 
 def findings(capture: Capture) -> list[Finding]:
-    """Compare poses and intrinsics with points, or among each other without points."""
+    """Compare the poses and intrinsics of a capture with its points.
+
+    Args:
+      capture: The capture.
+
+    Returns:
+      The findings, none if there are too few points.
+    """
     if capture.points is None or len(capture.points.position) < LEAST_POINTS:
         return gate_axes.findings(capture)
     count = len(capture.ids)

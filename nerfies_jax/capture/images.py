@@ -351,7 +351,15 @@ def write_png(path: AnyPath, pixels: np.ndarray):
 
 
 def unreadable(path: AnyPath, error: Exception) -> CaptureError:
-    """Make the error of an image that cannot be decoded."""
+    """Make the error of an image that cannot be decoded.
+
+    Args:
+      path: The image.
+      error: The reason.
+
+    Returns:
+      The error, with the remedy.
+    """
     reason = " ".join(str(error).split()) or type(error).__name__
     return CaptureError(
         f"{path}: not a readable image ({reason}); it may be truncated, so copy or "

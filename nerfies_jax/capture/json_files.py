@@ -77,7 +77,12 @@ def read_json(path: AnyPath, kind: Any = Any) -> Any:
 
 
 def write_json(path: AnyPath, value: Any):
-    """Write finite JSON values atomically, so a reader never sees half a file."""
+    """Write a JSON file atomically, so a reader never sees half a file.
+
+    Args:
+      path: The file.
+      value: JSON values, all finite.
+    """
     with replaced_file(path) as partial:
         partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
 

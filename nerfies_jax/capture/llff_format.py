@@ -132,7 +132,14 @@ def order_note(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def placed(poses: Poses) -> Placement:
-    """Normalize the scene by points on each viewing axis at the depth bounds."""
+    """Normalize the scene by points on each viewing axis at the depth bounds.
+
+    Args:
+      poses: The cameras.
+
+    Returns:
+      The placement.
+    """
     offset = poses.rotations[:, None, 2] * poses.bounds[..., None]
     points = (poses.positions[:, None] + offset).reshape(-1, 3)
     return place_by_points(points, poses.positions, poses.bounds.ravel())
@@ -198,7 +205,19 @@ def read_poses(path: pathlib.Path) -> Poses:
 
 
 def reduction_of(file: pathlib.Path, size: tuple[int, int], poses: Poses) -> int:
-    """Return the integer reduction of a stored image, and refuse any other size."""
+    """Return the integer factor by which a stored image is smaller.
+
+    Args:
+      file: The image.
+      size: Its width and height in pixels.
+      poses: The cameras, with the full size.
+
+    Returns:
+      The factor, 1 for an image of full size.
+
+    Raises:
+      CaptureError: If its size is not an integer fraction of the full one.
+    """
     ratio = max(1, round(poses.size[0] / size[0]))
     if np.abs(np.array(poses.size) / ratio - size).max() > 1:
         raise CaptureError(

@@ -83,7 +83,14 @@ def clock(names: Sequence[str]) -> Clock:
 
 
 def order(names: Sequence[str]) -> list[int]:
-    """Return the position of each name in natural order."""
+    """Return the position of each name in natural order.
+
+    Args:
+      names: Names of the frames.
+
+    Returns:
+      Positions, [frames].
+    """
     rows = sorted(range(len(names)), key=lambda row: frames.natural(names[row]))
     return np.argsort(rows).tolist()
 

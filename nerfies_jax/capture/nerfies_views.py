@@ -443,7 +443,15 @@ def _times(entries, path, ids):
 
 
 def only(views, rows):
-    """Select the frames of some rows."""
+    """Select frames.
+
+    Args:
+      views: Cameras of a directory.
+      rows: Indices of the frames.
+
+    Returns:
+      The views of these frames.
+    """
     if len(rows) == len(views.ids):
         return views
     new_index = np.full(len(views.ids), -1)

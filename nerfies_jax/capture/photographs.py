@@ -101,7 +101,18 @@ def _decode_apart(path, size, header_only):
 
 
 def decode_header(path: pathlib.Path) -> Header:
-    """Read the header of a photograph in this process, for `read_header`."""
+    """Read the header of a photograph in this process, for `read_header`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The header.
+
+    Raises:
+      Unreadable: As for `read_header`.
+      TooLarge: As for `read_header`.
+    """
     with _open(path) as image:
         tags = image.getexif()
         is_rotated = tags.get(_ORIENTATION, 1) in (5, 6, 7, 8)  # by 90 degrees
@@ -118,7 +129,17 @@ def decode_header(path: pathlib.Path) -> Header:
 
 
 def decode_upright(path: pathlib.Path) -> np.ndarray:
-    """Decode a photograph in this process, for `read_upright`."""
+    """Decode a photograph in this process, for `read_upright`.
+
+    Args:
+      path: The file.
+
+    Returns:
+      uint8 sRGB, [height, width, 3].
+
+    Raises:
+      CaptureError: As for `read_upright`.
+    """
     with _open(path) as image:
         image = PIL.ImageOps.exif_transpose(image)
         if image.mode == "F":

@@ -264,7 +264,14 @@ def has_lens(camera: Camera) -> bool:
 
 
 def pinhole(camera: Camera) -> Camera:
-    """Remove the distortion coefficients of a camera or of a batch."""
+    """Remove the distortion coefficients of cameras.
+
+    Args:
+      camera: A camera or a batch.
+
+    Returns:
+      The cameras without distortion.
+    """
     return camera._replace(
         radial=0 * camera.radial, tangential=0 * camera.tangential, fisheye=None
     )

@@ -63,7 +63,14 @@ def confines(
 
 
 def carried(function: Callable[..., Content]) -> Callable[..., Content]:
-    """Wrap a function so that the caller's folder confines it in other threads too."""
+    """Wrap a function so that the caller's `confined` folder holds in other threads.
+
+    Args:
+      function: The function.
+
+    Returns:
+      The confined function.
+    """
     folder = _folder.get()
 
     def run(*args: Any) -> Content:

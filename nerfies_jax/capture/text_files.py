@@ -51,7 +51,14 @@ def utf8(data: bytes) -> bytes:
 
 
 def forward_slashes(name: str) -> str:
-    """Replace the backslashes of Windows paths by slashes."""
+    """Replace the backslashes of Windows paths by slashes.
+
+    Args:
+      name: A path.
+
+    Returns:
+      The path with slashes.
+    """
     return name.replace("\\", "/")
 
 

@@ -198,7 +198,14 @@ def _fill_file(file, entries, other_entries):
 
 
 def stems(entries: list[Frame]) -> list[str]:
-    """Return the image paths of frames with forward slashes and without suffixes."""
+    """Return the image paths of frames without image suffixes.
+
+    Args:
+      entries: The frames.
+
+    Returns:
+      Paths with forward slashes.
+    """
     paths = [text_files.forward_slashes(entry.file_path) for entry in entries]
     return [
         path.removesuffix(suffix)

@@ -23,7 +23,14 @@ Reply = tuple[dict[str, Any], dict[str, np.ndarray]]
 def frames(
     path: str, most: int, rows: list[int] | None, gray: bool, damaged: str
 ) -> Iterator[Reply]:
-    """Decode frames, with the arguments of `video.read_video`.
+    """Decode frames, for `video.read_video`.
+
+    Args:
+      path: The video.
+      most: As for `video.read_video`.
+      rows: As for `video.read_video`.
+      gray: As for `video.read_video`.
+      damaged: As for `video.read_video`.
 
     Yields:
       Seconds and pixels of a frame, or empty dicts for a frame that is skipped.
@@ -68,7 +75,14 @@ def frames(
 
 
 def transfer(path: str) -> Iterator[Reply]:
-    """Find the transfer function of an HDR video, None for other videos."""
+    """Find the transfer function of an HDR video.
+
+    Args:
+      path: The video.
+
+    Yields:
+      The transfer function, None for other videos.
+    """
     with _opened(path) as container:
         frame = next(container.decode(_main_stream(container)), None)
         name = None if frame is None else TRANSFERS.get(int(frame.color_trc))
@@ -76,7 +90,14 @@ def transfer(path: str) -> Iterator[Reply]:
 
 
 def length(path: str) -> Iterator[Reply]:
-    """Read the number of frames of a video from its header."""
+    """Read the number of frames of a video from its header.
+
+    Args:
+      path: The video.
+
+    Yields:
+      The number of frames.
+    """
     with _opened(path) as container:
         stream = _main_stream(container)
         seconds = (container.duration or 0) / 1e6
@@ -85,7 +106,16 @@ def length(path: str) -> Iterator[Reply]:
 
 
 def notes(path: str, count: int, last: float) -> Iterator[Reply]:
-    """Describe anything unusual about a video, for `video.notes_of`."""
+    """Describe anything unusual about a video, for `video.notes_of`.
+
+    Args:
+      path: The video.
+      count: Number of frames that could be read.
+      last: Time of the last one in seconds.
+
+    Yields:
+      Notes.
+    """
     with _opened(path) as container:
         yield {"notes": _notes(container, count, last)}, {}
 

@@ -28,7 +28,14 @@ def unit(up: Sequence[float] | None) -> tuple[float, float, float] | None:
 
 
 def mean_up(cameras: Camera) -> np.ndarray:
-    """Return the mean of the up directions of cameras, [3], shorter than one."""
+    """Return the mean of the up directions of cameras.
+
+    Args:
+      cameras: Cameras, [frames].
+
+    Returns:
+      The mean of unit vectors, [3], which is shorter than one.
+    """
     return -np.asarray(cameras.camera_from_world, np.float64)[:, 1].mean(axis=0)
 
 

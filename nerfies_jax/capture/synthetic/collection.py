@@ -79,7 +79,7 @@ def _camera(spec, setting, rng):
     distance = ratio * setting.object_size
     azimuth = rng.uniform(-setting.arc_rad, setting.arc_rad)
     elevation = rng.uniform(*setting.elevation_rad)
-    back = backward(azimuth, elevation)
+    back = spherical_direction(azimuth, elevation)
     target = np.asarray(setting.target)
     aim = target + setting.object_size * rng.uniform(-0.15, 0.15, 3)
     # The object fills this share of the width, as far as lenses allow.
@@ -89,8 +89,16 @@ def _camera(spec, setting, rng):
     return cameras.look_at(target + distance * back, aim, up, focal_px, spec.size)
 
 
-def backward(azimuth, elevation) -> np.ndarray:
-    """Return the direction [..., 3] to cameras from their target, for angles in rad."""
+def spherical_direction(azimuth, elevation) -> np.ndarray:
+    """Return the direction from a target to a camera.
+
+    Args:
+      azimuth: Angle about the y axis in rad, zero along z, [...].
+      elevation: Angle above the xz plane in rad, [...].
+
+    Returns:
+      Unit vectors, [..., 3].
+    """
     x = np.sin(azimuth) * np.cos(elevation)
     z = np.cos(azimuth) * np.cos(elevation)
     return np.stack([x, np.sin(elevation), z], axis=-1)

@@ -130,7 +130,7 @@ def _snapshot_views(spec, seed):
     low, high = setting.elevation_rad
     elevation = low + (high - low) * place[:, 1]
     distance = rng.uniform(*setting.distance, len(cell))
-    back = collection.backward(azimuth, elevation)
+    back = collection.spherical_direction(azimuth, elevation)
     target = np.asarray(setting.target)
     aim = target + setting.aim * rng.uniform(-1, 1, back.shape)
     position = target + distance[:, None] * back

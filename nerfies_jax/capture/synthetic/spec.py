@@ -21,7 +21,11 @@ class Thing:
     motion: Motion | None = None  # None for a static position
 
     def moves(self) -> bool:
-        """Return whether any point of the object ever moves."""
+        """Return whether any point of the object ever moves.
+
+        Returns:
+          True for an object with a motion or a deformation.
+        """
         return self.motion is not None or self.shape.bends()
 
 
@@ -93,14 +97,28 @@ class Rig:
             )
 
     def angles(self, frames: int) -> list[float]:
-        """Return the angle in rad of the camera of each frame, zero in the middle."""
+        """Return the angle of the camera of each frame on the arc.
+
+        Args:
+          frames: Number of frames.
+
+        Returns:
+          Angles in rad, zero in the middle of the arc.
+        """
         return [
             (camera - (self.count - 1) / 2) * self.step_rad
             for camera in self.turns(frames)
         ]
 
     def turns(self, frames: int) -> list[int]:
-        """Return the index along the arc of the camera that observes each frame."""
+        """Return the index of the camera that observes each frame.
+
+        Args:
+          frames: Number of frames.
+
+        Returns:
+          Indices along the arc.
+        """
         last = self.count - 1
         return [last - abs(last - frame % (2 * last)) for frame in range(frames)]
 
@@ -338,7 +356,11 @@ class SceneSpec:
             raise ValueError(f"ambient={self.ambient} must lie in [0, 1]")
 
     def all_things(self) -> tuple[Thing, ...]:
-        """Return the objects in the order of their ids, with the transient last."""
+        """Return the objects in the order of their ids, with the transient last.
+
+        Returns:
+          The objects.
+        """
         if self.transient is None:
             return self.things
         return (*self.things, self.transient.thing)

@@ -264,7 +264,12 @@ def _watch(spec, thing, points, plan):
 
 
 def save(truth: SceneTruth, path: pathlib.Path):
-    """Write ground truth as one .npz file."""
+    """Write ground truth as one .npz file.
+
+    Args:
+      truth: The ground truth.
+      path: The file.
+    """
     fields = truth._asdict()
     for name in ("ids", "thing_names"):
         fields[name] = np.array(fields[name])
