@@ -1,6 +1,7 @@
 """Warps of fields fitted to known paths."""
 
 import dataclasses
+import functools
 import types
 
 import jax
@@ -85,6 +86,15 @@ def canonical_places(field, params):
     return places
 
 
+def mean_spread(places, paths):
+    """Mean distance of known positions in the template to the median of their point."""
+    frames = zip(paths.time, paths.position.swapaxes(0, 1), strict=True)
+    back = np.stack([places(time, points) for time, points in frames], axis=1)
+    back[~paths.known] = np.nan
+    off = back - np.nanmedian(back, axis=1, keepdims=True)
+    return np.nanmean(np.linalg.norm(off, axis=-1))
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["nerfies-small", "d-nerf-small"])
 def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
@@ -92,6 +102,8 @@ def test_a_fitted_warp_brings_a_body_to_one_place_and_moves_no_wall(name):
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit(field, params, paths, jax.random.key(0), TRACKS)
     places, canonical = canonical_places(field, fitted), []
+    assert mean_spread(canonical_places(field, params), paths) > 0.1
+    assert mean_spread(places, paths) < 0.03
     for frame in (3, 12):
         points = np.concatenate([paths.position[:, frame], paths.static])
         back, wall = np.split(places(paths.time[frame], points), [len(paths.position)])
@@ -232,13 +244,26 @@ def test_a_fitted_flow_leads_from_one_place_to_the_next_and_from_no_wall():
     params = field.init(jax.random.key(0))
     fitted = warp_fit.fit_flow(field, params, paths, jax.random.key(0), TRACKS)
     path, time = turning_body()
-    medium = fitted["scene_flow"]
 
-    def flow(point, time):
+    def flow(medium, point, time):
         spec, toward = field.spec.scene_flow, jnp.zeros(3)
         return scene_flow.dynamic(spec, medium, point, toward, time).flow
 
-    ask = jax.jit(jax.vmap(flow, (0, None)))
+    program = jax.jit(jax.vmap(flow, (None, 0, None)))
+
+    def error(params):
+        """Of the flow from and to every pair of frames that follow each other."""
+        ahead, back = np.moveaxis(
+            [program(params["scene_flow"], path[:, f], time[f]) for f in range(FRAMES)],
+            -2,
+            0,
+        )
+        true = np.diff(path.swapaxes(0, 1), axis=0)
+        off = np.stack([ahead[:-1] - true, back[1:] + true])
+        return np.linalg.norm(off, axis=-1).mean()
+
+    assert error(fitted) < 0.3 * error(params)
+    ask = functools.partial(program, fitted["scene_flow"])
     for frame in (3, 8, 12):  # the ninth was never observed
         ahead, back = np.moveaxis(np.asarray(ask(path[:, frame], time[frame])), 1, 0)
         true = path[:, frame + 1] - path[:, frame]
@@ -261,6 +286,11 @@ def test_points_seen_once_leave_everything_where_it_is():
     places = paths.position[known]
     moved = canonical_places(field, fitted)(0.5, places)
     assert np.abs(moved - places).max() < 0.03
+    off = [
+        canonical_places(field, fitted)(paths.time[frame], places[row : row + 1])
+        for row, frame in enumerate(np.arange(40) % FRAMES)
+    ]
+    assert np.linalg.norm(np.concatenate(off) - places, axis=-1).mean() < 5e-3
 
 
 def test_what_cannot_be_fitted_is_refused_by_name():

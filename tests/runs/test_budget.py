@@ -5,6 +5,10 @@ import pytest
 from nerfies_jax.runs import budget
 
 
+def test_a_quick_renderer_is_evaluated_as_asked():
+    assert budget.evaluations(0.02, 20.0, 4) == (4, 20.0)
+
+
 @pytest.mark.parametrize("frame_seconds", [0.02, 0.4, 0.6, 1.0, 1.9, 2.1, 10.0, 300.0])
 def test_evaluations_stay_a_tenth_of_the_training(frame_seconds):
     frames, every = budget.evaluations(frame_seconds, 20.0, 4)
