@@ -53,9 +53,15 @@ LEANS_ON = {
 }
 # Settings of motions on tiny scenes. Each takes those that it has.
 SMALL_NETWORK = {
-    **{"position": FEW, "base_time": FEW, "time": FEW},
-    **{"base_depth": 1, "base_width": 8, "basis_width": 8},
-    **{"depth": 1, "width": 8, "skips": ()},
+    "position": FEW,
+    "base_time": FEW,
+    "time": FEW,
+    "base_depth": 1,
+    "base_width": 8,
+    "basis_width": 8,
+    "depth": 1,
+    "width": 8,
+    "skips": (),
 }
 SMALL_MOTIONS = {
     KanMotionSpec: {"embedding": 4, "time_code": 3, "hidden": (6,), "kernels": 3},
@@ -63,8 +69,12 @@ SMALL_MOTIONS = {
     SE3BasesSpec: {"bases": 2, "knots": 3},
     NodeMotionSpec: {"nodes": 6, "links": 2, **SMALL_NETWORK},
     AnchorMotionSpec: {
-        **{"count": 2, "reference": 3, "residual": 2, "time_code": 3},
-        **{"width": 6, "make_width": 6},
+        "count": 2,
+        "reference": 3,
+        "residual": 2,
+        "time_code": 3,
+        "width": 6,
+        "make_width": 6,
     },
     TimeBasisSpec: {"count": 2, **SMALL_NETWORK},
 }
